@@ -1,0 +1,1 @@
+"""Drivers: bytes and CAN frames on a wire in, readings out (see docs/architecture.md)."""

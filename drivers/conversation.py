@@ -1,0 +1,81 @@
+"""What every driver is: one device's side of a wire as a pure state machine.
+
+No port, clock, thread, log or sleep: time is handed in. The reader (reader.py) owns the wire and drives it:
+
+    conversation.connected(now)                       the wire was (re)opened: forget everything, start from reset
+    for item in conversation.requests(now): send it   at least every 20 ms, and after every receive
+    for reading in conversation.receive(chunk, stamp): queue it
+    for item in conversation.farewell(): send it      motors and lasers off
+
+`Wire` is `bytes` on serial and TCP lines, `CanFrame` on CAN. Any split of the same bytes gives the same readings.
+A conversation never raises on what comes over the wire: it counts the reason in `counters.drops` and goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from drivers.readings import ClockFit, Identity, LinkState, Reading, SourceCounters
+
+
+@dataclass(frozen=True, slots=True)
+class CanFrame:
+    """A classic CAN frame. can_id: 11 bits, or 29 when extended. A remote frame has no data; dlc then asks a length."""
+
+    can_id: int
+    data: bytes = b""
+    extended: bool = False
+    remote: bool = False
+    dlc: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SetBaudRate:
+    """Ask the reader to change the serial line's speed, in order with the bytes sent before and after it."""
+
+    bits_per_s: int
+
+
+WireT = TypeVar("WireT", bytes, CanFrame)
+
+
+class Conversation(Protocol[WireT]):
+    """One device on a wire. See the module's docstring for how it is driven."""
+
+    @property
+    def state(self) -> LinkState:
+        """SILENT until the device answers, STARTING until readings flow, then RUNNING."""
+
+    @property
+    def trouble(self) -> str | None:
+        """What is wrong now and how to repair it, in one line, or None."""
+
+    @property
+    def identity(self) -> Identity | None:
+        """Who the device says it is, once it said so."""
+
+    @property
+    def clock_fit(self) -> ClockFit | None:
+        """The device clock against the host's, or None for a device without a clock."""
+
+    @property
+    def counters(self) -> SourceCounters:
+        """What was counted since construction (not reset by connected())."""
+
+    @property
+    def silence_limit_ns(self) -> int:
+        """No reading for longer than this means that the device is lost: 3 periods, never above 500 ms."""
+
+    def connected(self, now_ns: int) -> None:
+        """The wire was opened or reopened: forget partial messages, begin with reset and resynchronisation."""
+
+    def receive(self, chunk: WireT, stamp_ns: int) -> Iterator[Reading]:
+        """Take what arrived at stamp_ns; yields finished readings. Must be exhausted by the caller."""
+
+    def requests(self, now_ns: int) -> Sequence[WireT | SetBaudRate]:
+        """What is to be sent now; also where time-outs are noticed and questions repeated."""
+
+    def farewell(self) -> Sequence[WireT | SetBaudRate]:
+        """What leaves the device safe: laser off, motor off, streaming stopped."""

@@ -1,0 +1,1 @@
+"""Grid maps (S26 to S33)."""

@@ -1,0 +1,33 @@
+"""One sweep of a range sensor, as maps take it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """A sweep in the frame of its sensor, beams in the order they were measured.
+
+    stamp_ns: the first beam.  beam_period_ns: from one beam to the next (0: all at once).
+    bearing_rad: (N,) counter-clockwise from the sensor's x axis.
+    range_m: (N,) +inf nothing seen up to range_max_m, -inf too close to measure, NaN invalid (nothing known).
+    """
+
+    stamp_ns: int
+    beam_period_ns: float
+    bearing_rad: F64
+    range_m: F64
+    range_min_m: float
+    range_max_m: float
+
+    def points(self) -> F64:
+        """(M, 2) end points of the beams that hit something, sensor frame, in beam order."""
+        hit = np.isfinite(self.range_m)
+        r, a = self.range_m[hit], self.bearing_rad[hit]
+        return np.stack((r * np.cos(a), r * np.sin(a)), axis=-1)

@@ -1,0 +1,128 @@
+"""What fusion hands to the publisher, the store and the recording: immutable, stamped, named. No bytes yet.
+
+Stamps are host monotonic nanoseconds; the publisher turns them into wall time at the edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.frames import Pose2
+from mapping.grids.patch import GridPatch
+from mapping.scan import Scan
+from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ScanOut:
+    """A laser's sweep: key scan/<sensor>."""
+
+    sensor: str
+    scan: Scan
+    base_from_sensor: Pose2
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class RangesOut:
+    """A round of sonar ranges, for the page and ROS: key range/<sensor>. One entry per transducer of the chain."""
+
+    sensor: str
+    stamp_ns: int
+    base_from_transducer: tuple[Pose2, ...]
+    cone_rad: float
+    range_min_m: float
+    range_max_m: float
+    range_m: tuple[float, ...]  # +inf nothing, -inf too close, NaN invalid or not looked
+
+
+@dataclass(frozen=True, slots=True)
+class PolarOut:
+    """Key sectors/polar/<name>."""
+
+    name: str
+    snapshot: PolarSnapshot
+
+
+@dataclass(frozen=True, slots=True)
+class RectOut:
+    """Key sectors/rect/<name>."""
+
+    name: str
+    snapshot: RectSnapshot
+
+
+@dataclass(frozen=True, slots=True)
+class OdomOut:
+    """Key odom: base in the odom frame. covariance: (3, 3) of x, y, yaw. twist: forward m/s, yaw rad/s."""
+
+    stamp_ns: int
+    odom_from_base: Pose2
+    covariance: F64
+    forward_m_s: float
+    yaw_rad_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PoseOut:
+    """Key pose: base in the map frame, and the correction map_from_odom behind it."""
+
+    stamp_ns: int
+    map_from_base: Pose2
+    map_from_odom: Pose2
+    covariance: F64
+
+
+@dataclass(frozen=True, slots=True)
+class GridOut:
+    """Key map/grid: the whole map-fixed grid. epoch: counts full grids; updates name the epoch they belong to."""
+
+    stamp_ns: int
+    epoch: int
+    patch: GridPatch
+
+
+@dataclass(frozen=True, slots=True)
+class GridUpdateOut:
+    """Key map/grid/update: a changed rectangle of the grid `epoch`."""
+
+    stamp_ns: int
+    epoch: int
+    patch: GridPatch
+
+
+@dataclass(frozen=True, slots=True)
+class SourceHealth:
+    """One device, as health/<sensor> says it. level: 0 ok, 1 warning, 2 error, 3 stale (as in DiagnosticStatus)."""
+
+    name: str
+    kind: str
+    level: int
+    state: str
+    text: str
+    identity: str
+    rate_hz: float
+    age_ns: int  # of the newest reading, -1 never
+    readings: int
+    drops: dict[str, int]
+    clock: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class HealthOut:
+    """Keys health, health/<sensor>, health/json."""
+
+    stamp_ns: int
+    level: int
+    text: str
+    sources: tuple[SourceHealth, ...]
+    counters: dict[str, int]  # of the daemon itself: queues, drops by name
+    process: dict[str, float]  # cpu_percent, memory_mb, ...
+
+
+Output = ScanOut | RangesOut | PolarOut | RectOut | OdomOut | PoseOut | GridOut | GridUpdateOut | HealthOut
