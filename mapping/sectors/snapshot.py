@@ -30,7 +30,7 @@ class PolarSnapshot:
     """A polar sector map at one instant (S34, S35); N sectors, counter-clockwise from edges_rad[0].
 
     base_from_sensor: the virtual sensor's pose.  edges_rad: (N + 1,) ascending, virtual sensor frame.
-    state: (N,) SectorState.  distance_m: (N,) from the virtual sensor's origin: to the nearest obstacle when OBSTACLE (and
+    state: (N,) SectorState.  distance_m: (N,) from the virtual origin: to the nearest obstacle when OBSTACLE (and
     when STALE and last an obstacle), up to which the whole sector was seen free when FREE, else NaN.
     bearing_rad: (N,) of the nearest obstacle, NaN if none.  clearance_m: (N,) distance_m less the stretch inside the
     vehicle's outline along that bearing (NaN where distance_m is).  age_ns: (N,) since the newest evidence, -1 never.
