@@ -1,0 +1,104 @@
+"""`umfeld demo`: emulated robot, daemon and page as three processes, wired together on this machine only."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import time
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.errors import Trouble
+from service.processes import Child, Family
+
+app = typer.Typer()
+
+
+@app.command()
+def demo(
+    *,
+    headless: Annotated[bool, typer.Option("--headless", help="Do not open a browser.")] = False,
+    seconds: Annotated[float, typer.Option(min=0.0, help="End after so many seconds; 0: when interrupted.")] = 0.0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="The page's port on 127.0.0.1; 0: a free one.")] = 0,
+    world: Annotated[str, typer.Option(help="The world to drive through: a name or a floor plan file.")] = "flat",
+    preset: Annotated[str, typer.Option(help="The robot.")] = "artos",
+    keep: Annotated[Path | None, typer.Option(help="Keep configuration, outputs and map in this folder.")] = None,
+) -> None:
+    """An emulated robot maps a flat before your eyes: emulated devices on ptys, the daemon, the page.
+
+    Example: umfeld demo --headless --seconds 60 --port 8080
+    """
+    folder = keep or Path(tempfile.mkdtemp(prefix="umfeld-demo-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with Family(folder) as family:
+            address = _start_all(family, folder, world=world, preset=preset, port=port)
+            typer.echo(f"page     {address}")
+            typer.echo(f"outputs  {folder}")
+            typer.echo("Ctrl-C ends the demo." if not seconds else f"The demo ends by itself after {seconds:.0f} s.")
+            sys.stdout.flush()
+            if not headless:
+                webbrowser.open(address)
+            _watch(family, seconds)
+    except KeyboardInterrupt:
+        typer.echo("ended")
+    finally:
+        if keep is None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start_all(family: Family, folder: Path, *, world: str, preset: str, port: int) -> str:
+    """Start the three in the order in which they need each other; returns the page's address."""
+    python = [sys.executable, "-m"]
+    config = folder / "umfeld.toml"
+    family.start("sim", [*python, "sim_devices", "--preset", preset, "--world", world, "--dir", str(folder)])
+    family.wait_for("the emulators' configuration", config.exists, seconds=20.0)
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    overlay = folder / "umfeld.d"
+    overlay.mkdir(exist_ok=True)
+    (overlay / "demo.toml").write_text(
+        f'[network]\nlisten = ["{endpoint}"]\n\n[store]\npath = "{folder / "demo.umfeld"}"\n'
+    )
+    family.start("run", [*python, "service", "run", "--config", str(config)])
+    family.wait_for("the daemon", lambda: _answers(endpoint), seconds=60.0)
+    view = family.start("view", [*python, "service", "view", "--connect", endpoint, "--port", str(port)])
+    family.wait_for("the page", lambda: _address_in(view) is not None, seconds=20.0)
+    address = _address_in(view)
+    if address is None:
+        raise Trouble("the page gave no address")
+    return address
+
+
+def _watch(family: Family, seconds: float) -> None:
+    deadline = time.monotonic() + seconds if seconds else float("inf")
+    while time.monotonic() < deadline:
+        family.check()
+        time.sleep(0.2)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _answers(endpoint: str) -> bool:
+    host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
+    with socket.socket() as probe:
+        probe.settimeout(0.2)
+        return probe.connect_ex((host, int(port))) == 0
+
+
+def _address_in(view: Child) -> str | None:
+    """The page's address, once the view process has printed its line."""
+    for line in view.log.read_text(errors="replace").splitlines():
+        if line.startswith("http://"):
+            return line.strip()
+    return None
