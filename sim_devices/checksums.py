@@ -1,0 +1,27 @@
+"""Sums and check codes as the emulated devices compute them, each pinned in the tests by published bytes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def scip_sum(line: bytes) -> int:
+    """Sum character of one SCIP line (without its line feed): the low six bits of the byte sum, plus 30h."""
+    return (sum(line) & 0x3F) + 0x30
+
+
+def scip_sums(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Sum characters of many lines of equal length at once. rows: (M, L); returns (M,)."""
+    sums: NDArray[np.uint8] = ((rows.sum(axis=1, dtype=np.uint32) & 0x3F) + 0x30).astype(np.uint8)
+    return sums
+
+
+def usboard_crc(data: bytes) -> int:
+    """The 16-bit code after a Neobotix USBoard serial message: polynomial 1021h over byte pairs, start 0."""
+    crc = previous = 0
+    for byte in data:
+        crc = ((crc << 1) ^ 0x1021) & 0xFFFF if crc & 0x8000 else crc << 1
+        crc ^= byte | previous << 8
+        previous = byte
+    return crc
