@@ -1,0 +1,585 @@
+"""What fusion hands out, as the bytes that travel: ROS 2 CDR for standard things, JSON documents for the rest.
+
+Stamps leave as wall clock: the offset wall minus monotonic is handed in with every output. JSON says null where a
+number is not known, never NaN. Documents are described in docs/keys.md and docs/schemas/.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.frames import Pose2
+from mapping.grids.patch import GridPatch
+from mapping.scan import Scan
+from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot, SectorState
+from service import cdr, topics
+from service.outputs import (
+    GridOut,
+    GridUpdateOut,
+    HealthOut,
+    OdomOut,
+    Output,
+    PolarOut,
+    PoseOut,
+    RangesOut,
+    RectOut,
+    ScanOut,
+    SourceHealth,
+)
+from service.topics import Topic
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
+
+UPDATE_CELLS_MAX = 32_000  # with the header below 32 KB
+GRID_ATTACHMENT = struct.Struct("<QQ")
+"""Epoch of the full grid, number of the update within it (from 1; 0 on the full grid itself)."""
+
+_LEVELS = ("ok", "warning", "error", "stale")
+_STATES = {state.value: state.name.lower() for state in SectorState}
+_NANOS = 1_000_000_000
+_LONGEST_SCAN_PERIOD_NS = 10 * _NANOS
+_UNEVEN = 0.25  # of the angle between beams: what still counts as evenly spaced
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One sample to publish: suffix is the key below the base, stamp_ns wall clock."""
+
+    topic: Topic
+    suffix: str
+    payload: bytes
+    stamp_ns: int
+    attachment: bytes | None = None
+
+    @property
+    def encoding(self) -> str:
+        """The Zenoh encoding, from the table."""
+        return self.topic.encoding
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Names of the reference frames (REP-105). A sensor's frame is named like the sensor."""
+
+    map: str = "map"
+    odom: str = "odom"
+    base: str = "base_link"
+
+
+@dataclass(frozen=True, slots=True)
+class SensorPlace:
+    """Where a sensor sits, for `info` and the fixed transforms. kind: laser, sonar or wheels."""
+
+    name: str
+    kind: str
+    base_from_sensor: Pose2
+    height_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RobotInfo:
+    """What the `info` document says. started_ns: wall clock. footprint_m: polygon in the base frame."""
+
+    robot: str
+    base_key: str
+    version: str
+    started_ns: int
+    sensors: tuple[SensorPlace, ...] = ()
+    footprint_m: tuple[tuple[float, float], ...] = ()
+    frames: Frames = Frames()
+
+
+class Encoder:
+    """Outputs to messages. It remembers what single outputs do not say: scan periods and where the full grid lies.
+
+    Scans and grids may be encoded from two threads: their memories are separate.
+    """
+
+    def __init__(self, frames: Frames | None = None, *, range_messages: bool = True) -> None:
+        """range_messages: also publish each ultrasonic transducer as a ROS 2 Range."""
+        self._frames = frames or Frames()
+        self._range_messages = range_messages
+        self._scan_stamps: dict[str, int] = {}
+        self._polar_heads: dict[str, tuple[bytes, list[str]]] = {}
+        self._rect_heads: dict[str, tuple[bytes, list[str]]] = {}
+        self._grid: _GridPlace | None = None
+        self.cells_outside = 0  # cells of updates that lay outside their full grid and were not sent
+
+    def encode(self, output: Output, wall_offset_ns: int) -> list[Message]:
+        """The messages of one output. wall_offset_ns: wall clock minus monotonic clock."""
+        match output:
+            case ScanOut():
+                return [self._scan(output, wall_offset_ns)]
+            case PolarOut():
+                return [self._polar(output, wall_offset_ns)]
+            case RectOut():
+                return [self._rect(output, wall_offset_ns)]
+            case OdomOut():
+                return self._odom(output, wall_offset_ns)
+            case PoseOut():
+                return self._pose(output, wall_offset_ns)
+            case RangesOut():
+                return self._ranges(output, wall_offset_ns)
+            case GridOut():
+                return [self._full_grid(output, wall_offset_ns)]
+            case GridUpdateOut():
+                return self._grid_update(output, wall_offset_ns)
+            case HealthOut():
+                return self._health(output, wall_offset_ns)
+
+    def info(self, info: RobotInfo) -> list[Message]:
+        """The messages of `info` and of the fixed transforms, `tf/static`."""
+        transforms = [
+            cdr.Transform(
+                info.started_ns,
+                info.frames.base,
+                place.name,
+                (place.base_from_sensor.x_m, place.base_from_sensor.y_m, place.height_m),
+                _quaternion(place.base_from_sensor.yaw_rad),
+            )
+            for place in info.sensors
+        ]
+        return [
+            Message(topics.INFO, "info", _json(info_document(info)), info.started_ns),
+            Message(topics.TF_STATIC, "tf/static", cdr.encode_transforms(transforms), info.started_ns),
+        ]
+
+    def _scan(self, out: ScanOut, offset_ns: int) -> Message:
+        stamp_ns = out.scan.stamp_ns + offset_ns
+        period_ns = out.scan.stamp_ns - self._scan_stamps.get(out.sensor, out.scan.stamp_ns)
+        self._scan_stamps[out.sensor] = out.scan.stamp_ns
+        scan_time_s = period_ns / _NANOS if 0 < period_ns < _LONGEST_SCAN_PERIOD_NS else 0.0
+        payload = cdr.encode_laser(laser_message(out.scan, out.sensor, stamp_ns, scan_time_s))
+        return Message(topics.SCAN, f"scan/{out.sensor}", payload, stamp_ns)
+
+    def _polar(self, out: PolarOut, offset_ns: int) -> Message:
+        snap, stamp_ns = out.snapshot, out.snapshot.stamp_ns + offset_ns
+        fingerprint = snap.edges_rad.tobytes()
+        known = self._polar_heads.get(out.name)
+        if known is None or known[0] != fingerprint:
+            known = self._polar_heads[out.name] = (fingerprint, _polar_heads(snap.edges_rad))
+        text = _document_head("polar", out.name, stamp_ns, self._frames.base, snap.base_from_sensor)
+        text += ",".join(_polar_sectors(snap, known[1])) + "]}"
+        return Message(topics.POLAR, f"sectors/polar/{out.name}", text.encode(), stamp_ns)
+
+    def _rect(self, out: RectOut, offset_ns: int) -> Message:
+        snap, stamp_ns = out.snapshot, out.snapshot.stamp_ns + offset_ns
+        fingerprint = snap.x_edges_m.tobytes() + b"/" + snap.y_edges_m.tobytes()
+        known = self._rect_heads.get(out.name)
+        if known is None or known[0] != fingerprint:
+            known = self._rect_heads[out.name] = (fingerprint, _rect_heads(snap.x_edges_m, snap.y_edges_m))
+        rows, columns = snap.state.shape
+        text = _document_head(
+            "rect", out.name, stamp_ns, self._frames.base, snap.base_from_sensor, rows=rows, columns=columns
+        )
+        text += ",".join(_rect_sectors(snap, known[1])) + "]}"
+        return Message(topics.RECT, f"sectors/rect/{out.name}", text.encode(), stamp_ns)
+
+    def _odom(self, out: OdomOut, offset_ns: int) -> list[Message]:
+        stamp_ns, pose = out.stamp_ns + offset_ns, out.odom_from_base
+        payload = cdr.encode_odometry(
+            cdr.OdometryMessage(
+                stamp_ns,
+                self._frames.odom,
+                self._frames.base,
+                (pose.x_m, pose.y_m, 0.0),
+                _quaternion(pose.yaw_rad),
+                _planar_covariance(out.covariance),
+                (out.forward_m_s, 0.0, 0.0),
+                (0.0, 0.0, out.yaw_rad_s),
+                np.zeros((6, 6)),
+            )
+        )
+        return [
+            Message(topics.ODOM, "odom", payload, stamp_ns),
+            self._transform(stamp_ns, self._frames.odom, self._frames.base, pose),
+        ]
+
+    def _pose(self, out: PoseOut, offset_ns: int) -> list[Message]:
+        stamp_ns, pose = out.stamp_ns + offset_ns, out.map_from_base
+        payload = cdr.encode_pose(
+            cdr.PoseWithCovariance(
+                stamp_ns,
+                self._frames.map,
+                (pose.x_m, pose.y_m, 0.0),
+                _quaternion(pose.yaw_rad),
+                _planar_covariance(out.covariance),
+            )
+        )
+        return [
+            Message(topics.POSE_KEY, "pose", payload, stamp_ns),
+            self._transform(stamp_ns, self._frames.map, self._frames.odom, out.map_from_odom),
+        ]
+
+    def _transform(self, stamp_ns: int, frame: str, child: str, pose: Pose2) -> Message:
+        transform = cdr.Transform(stamp_ns, frame, child, (pose.x_m, pose.y_m, 0.0), _quaternion(pose.yaw_rad))
+        return Message(topics.TF_KEY, "tf", cdr.encode_transforms([transform]), stamp_ns)
+
+    def _ranges(self, out: RangesOut, offset_ns: int) -> list[Message]:
+        stamp_ns = out.stamp_ns + offset_ns
+        document = _json(ranges_document(out, stamp_ns, self._frames.base))
+        messages = [Message(topics.RANGES, f"range/{out.sensor}", document, stamp_ns)]
+        if self._range_messages:
+            for number, range_m in enumerate(out.range_m, start=1):
+                one = cdr.RangeOne(
+                    stamp_ns, f"{out.sensor}_{number}", out.cone_rad, out.range_min_m, out.range_max_m, range_m
+                )
+                suffix = f"range/{out.sensor}/{number}"
+                messages.append(Message(topics.RANGE_ONE, suffix, cdr.encode_range(one), stamp_ns))
+        return messages
+
+    def _full_grid(self, out: GridOut, offset_ns: int) -> Message:
+        stamp_ns = out.stamp_ns + offset_ns
+        self._grid = _GridPlace(out.epoch, out.patch.row0, out.patch.col0, *out.patch.cells.shape)
+        payload = cdr.encode_grid(grid_message(out.patch, self._frames.map, stamp_ns))
+        return Message(topics.MAP_GRID, "map/grid", payload, stamp_ns, GRID_ATTACHMENT.pack(out.epoch, 0))
+
+    def _grid_update(self, out: GridUpdateOut, offset_ns: int) -> list[Message]:
+        place = self._grid
+        if place is None or place.epoch != out.epoch:  # its full grid never came by: nobody could apply it
+            self.cells_outside += out.patch.cells.size
+            return []
+        cells, x, y = place.clip(out.patch)
+        self.cells_outside += out.patch.cells.size - cells.size
+        stamp_ns = out.stamp_ns + offset_ns
+        messages = []
+        for row, column, piece in _pieces(cells):
+            place.updates += 1
+            payload = cdr.encode_grid_update(cdr.GridUpdate(stamp_ns, self._frames.map, x + column, y + row, piece))
+            attachment = GRID_ATTACHMENT.pack(out.epoch, place.updates)
+            messages.append(Message(topics.MAP_GRID_UPDATE, "map/grid/update", payload, stamp_ns, attachment))
+        return messages
+
+    def _health(self, out: HealthOut, offset_ns: int) -> list[Message]:
+        stamp_ns = out.stamp_ns + offset_ns
+        daemon = cdr.Status(
+            out.level, "umfeld: daemon", out.text, "", {k: str(v) for k, v in {**out.counters, **out.process}.items()}
+        )
+        sources = [(source.name, _status_of(source)) for source in out.sources]
+        everything = cdr.Diagnostics(stamp_ns, "", (daemon, *(status for _, status in sources)))
+        messages = [
+            Message(topics.HEALTH, "health", cdr.encode_diagnostics(everything), stamp_ns),
+            Message(topics.HEALTH_JSON, "health/json", _json(health_document(out, stamp_ns)), stamp_ns),
+        ]
+        for name, status in sources:
+            payload = cdr.encode_diagnostics(cdr.Diagnostics(stamp_ns, "", (status,)))
+            messages.append(Message(topics.HEALTH_ONE, f"health/{name}", payload, stamp_ns))
+        return messages
+
+
+@dataclass(slots=True)
+class _GridPlace:
+    """Where the newest full grid lies, so that updates can be placed in it."""
+
+    epoch: int
+    row0: int
+    col0: int
+    rows: int
+    columns: int
+    updates: int = 0
+
+    def clip(self, patch: GridPatch) -> tuple[NDArray[np.int8], int, int]:
+        """The part of a patch inside the full grid, and its column and row there."""
+        top, left = max(0, self.row0 - patch.row0), max(0, self.col0 - patch.col0)
+        x, y = patch.col0 + left - self.col0, patch.row0 + top - self.row0
+        cells = patch.cells[top : max(top, top + self.rows - y), left : max(left, left + self.columns - x)]
+        return cells, x, y
+
+
+def _pieces(cells: NDArray[np.int8]) -> list[tuple[int, int, NDArray[np.int8]]]:
+    """Cut a rectangle into pieces of at most UPDATE_CELLS_MAX cells: (row, column, piece), whole rows if they fit."""
+    rows, columns = cells.shape
+    if rows == 0 or columns == 0:
+        return []
+    width = min(columns, UPDATE_CELLS_MAX)
+    height = max(1, UPDATE_CELLS_MAX // width)
+    return [
+        (row, column, cells[row : row + height, column : column + width])
+        for row in range(0, rows, height)
+        for column in range(0, columns, width)
+    ]
+
+
+def laser_message(scan: Scan, frame: str, stamp_ns: int, scan_time_s: float) -> cdr.Laser:
+    """A scan as LaserScan (REP-117: +inf nothing, -inf too close, NaN invalid).
+
+    The message knows only evenly spaced beams, in the order measured (a scanner that turns clockwise has a negative
+    increment). Beams that are not evenly spaced are sorted into as many even bins, the nearest range of a bin wins,
+    an empty bin is NaN.
+    """
+    count = scan.bearing_rad.size
+    if count == 0:
+        nothing = np.zeros(0, dtype=np.float32)
+        return cdr.Laser(stamp_ns, frame, 0.0, 0.0, 0.0, 0.0, scan_time_s, scan.range_min_m, scan.range_max_m, nothing)
+    bearing: F64 = np.unwrap(scan.bearing_rad)
+    span = float(bearing[-1] - bearing[0])
+    increment = span / (count - 1) if count > 1 else 0.0
+    ranges = scan.range_m.astype(np.float32)
+    ideal = bearing[0] + increment * np.arange(count)
+    if np.abs(bearing - ideal).max() > _UNEVEN * abs(increment):
+        ranges, low, span = _even_bins(bearing, ranges)
+        increment = span / (count - 1)
+        bearing = np.asarray(low + increment * np.arange(count))
+    return cdr.Laser(
+        stamp_ns,
+        frame,
+        float(bearing[0]),
+        float(bearing[-1]),
+        increment,
+        scan.beam_period_ns / _NANOS,
+        scan_time_s,
+        scan.range_min_m,
+        scan.range_max_m,
+        ranges,
+    )
+
+
+def _even_bins(bearing_rad: F64, range_m: F32) -> tuple[F32, float, float]:
+    """Ranges in as many even bins as there are beams; returns them, the first bin's bearing and the signed span."""
+    low, high = float(bearing_rad.min()), float(bearing_rad.max())
+    if high - low > 2.0 * math.pi:  # a little more than a turn: fold the rest onto its beginning
+        bearing_rad = low + (bearing_rad - low) % (2.0 * math.pi)
+        high = float(bearing_rad.max())
+    if bearing_rad[0] > bearing_rad[-1]:
+        low, high = high, low
+    count = bearing_rad.size
+    step = (high - low) / (count - 1) or 1.0
+    index = np.clip(np.rint((bearing_rad - low) / step).astype(np.int64), 0, count - 1)
+    bins = np.full(count, np.nan, dtype=np.float32)
+    np.fmin.at(bins, index, range_m)  # fmin: a range beats NaN, -inf (too close) beats all
+    return bins, low, high - low
+
+
+def grid_message(patch: GridPatch, frame: str, stamp_ns: int) -> cdr.Grid:
+    """A grid as OccupancyGrid: row 0 lowest, origin at the lower left corner of the first cell."""
+    r = patch.resolution_m
+    return cdr.Grid(stamp_ns, frame, r, (patch.col0 * r, patch.row0 * r, 0.0), (0.0, 0.0, 0.0, 1.0), patch.cells)
+
+
+def ranges_document(out: RangesOut, stamp_ns: int, base_frame: str) -> dict[str, object]:
+    """umfeld.ranges.v1."""
+    return {
+        "schema": "umfeld.ranges.v1",
+        "sensor": out.sensor,
+        "stamp": stamp_document(stamp_ns),
+        "frame": base_frame,
+        "cone_rad": _number(out.cone_rad, 5),
+        "range_min_m": _number(out.range_min_m),
+        "range_max_m": _number(out.range_max_m),
+        "transducers": [
+            {
+                "number": number,
+                "pose": pose_document(pose),
+                "status": _range_status(range_m),
+                "range_m": _number(range_m),
+            }
+            for number, (pose, range_m) in enumerate(zip(out.base_from_transducer, out.range_m), start=1)
+        ],
+    }
+
+
+def _range_status(range_m: float) -> str:
+    if math.isnan(range_m):
+        return "invalid"
+    if math.isinf(range_m):
+        return "nothing" if range_m > 0 else "too_close"
+    return "echo"
+
+
+def health_document(out: HealthOut, stamp_ns: int) -> dict[str, object]:
+    """umfeld.health.v1."""
+    return {
+        "schema": "umfeld.health.v1",
+        "stamp": stamp_document(stamp_ns),
+        "level": _level(out.level),
+        "text": out.text,
+        "sources": [
+            {
+                "name": source.name,
+                "kind": source.kind,
+                "level": _level(source.level),
+                "state": source.state,
+                "text": source.text,
+                "identity": source.identity,
+                "rate_hz": _number(source.rate_hz, 2),
+                "age_s": _number(source.age_ns / _NANOS, 3) if source.age_ns >= 0 else None,
+                "readings": source.readings,
+                "drops": dict(source.drops),
+                "clock": {key: _number(value, 3) for key, value in source.clock.items()},
+            }
+            for source in out.sources
+        ],
+        "counters": dict(out.counters),
+        "process": {key: _number(value, 3) for key, value in out.process.items()},
+    }
+
+
+def info_document(info: RobotInfo) -> dict[str, object]:
+    """umfeld.info.v1."""
+    return {
+        "schema": "umfeld.info.v1",
+        "project": "umfeld",
+        "version": info.version,
+        "robot": info.robot,
+        "base_key": info.base_key,
+        "started": stamp_document(info.started_ns),
+        "frames": {"map": info.frames.map, "odom": info.frames.odom, "base": info.frames.base},
+        "footprint_m": [list(corner) for corner in info.footprint_m],
+        "sensors": [
+            {
+                "name": place.name,
+                "kind": place.kind,
+                "frame": place.name,
+                "pose": {**pose_document(place.base_from_sensor), "z_m": _number(place.height_m)},
+            }
+            for place in info.sensors
+        ],
+        "keys": [
+            {
+                "key": f"{info.base_key}/{topic.pattern}",
+                "payload": topic.payload,
+                "encoding": topic.encoding,
+                "rate": topic.rate,
+                "cached": topic.cached,
+                "meaning": topic.meaning,
+            }
+            for topic in topics.TOPICS
+        ],
+    }
+
+
+def stamp_document(stamp_ns: int) -> dict[str, int]:
+    """A wall clock stamp as ROS has it: whole seconds since 1970 and nanoseconds (a double could not hold both)."""
+    seconds, nanos = divmod(stamp_ns, _NANOS)
+    return {"sec": seconds, "nanosec": nanos}
+
+
+def pose_document(pose: Pose2) -> dict[str, float | None]:
+    """A planar pose."""
+    return {"x_m": _number(pose.x_m), "y_m": _number(pose.y_m), "yaw_rad": _number(pose.yaw_rad, 6)}
+
+
+def _json(document: Mapping[str, object]) -> bytes:
+    return json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+
+
+def _number(value: float, digits: int = 4) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None
+
+
+def _level(level: int) -> str:
+    return _LEVELS[level] if 0 <= level < len(_LEVELS) else "error"
+
+
+def _quaternion(yaw_rad: float) -> cdr.Quaternion:
+    return (0.0, 0.0, math.sin(yaw_rad / 2.0), math.cos(yaw_rad / 2.0))
+
+
+def _planar_covariance(covariance: F64) -> F64:
+    """(3, 3) of x, y, yaw into the (6, 6) of x, y, z, roll, pitch, yaw; what a planar vehicle cannot do is 0."""
+    wide = np.zeros((6, 6))
+    wide[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
+    return wide
+
+
+def _status_of(source: SourceHealth) -> cdr.Status:
+    values = {
+        "kind": source.kind,
+        "state": source.state,
+        "rate_hz": f"{source.rate_hz:.2f}",
+        "age_s": f"{source.age_ns / _NANOS:.3f}" if source.age_ns >= 0 else "never",
+        "readings": str(source.readings),
+        **{f"drops.{reason}": str(count) for reason, count in source.drops.items()},
+        **{f"clock.{key}": f"{value:.3f}" for key, value in source.clock.items()},
+    }
+    return cdr.Status(source.level, f"umfeld: {source.name}", source.text or source.state, source.identity, values)
+
+
+# The sector documents go out at up to 40 Hz each: they are written as text, with what never changes kept ready.
+
+
+def _document_head(kind: str, name: str, stamp_ns: int, frame: str, origin: Pose2, **more: int) -> str:
+    head = {
+        "schema": "umfeld.sectors.v1",
+        "kind": kind,
+        "name": name,
+        "stamp": stamp_document(stamp_ns),
+        "frame": frame,
+        "origin": pose_document(origin),
+        **more,
+    }
+    return json.dumps(head, separators=(",", ":"), ensure_ascii=False)[:-1] + ',"sectors":['
+
+
+def _polar_heads(edges_rad: F64) -> list[str]:
+    edges = edges_rad.tolist()
+    return [
+        f'{{"index":{i},"start_rad":{a:.6f},"stop_rad":{b:.6f},"center_rad":{(a + b) / 2.0:.6f},"state":"'
+        for i, (a, b) in enumerate(pairwise(edges))
+    ]
+
+
+def _polar_sectors(snap: PolarSnapshot, heads: Sequence[str]) -> list[str]:
+    names = _source_names(snap.sources)
+    return [
+        f'{head}{_STATES[state]}","bearing_rad":{bearing},"distance_m":{distance},"clearance_m":{clearance},'
+        f'"age_s":{age},"source":{names[source]}}}'
+        for head, state, bearing, distance, clearance, age, source in zip(
+            heads,
+            snap.state.tolist(),
+            _texts(snap.bearing_rad, "%.5f"),
+            _texts(snap.distance_m, "%.4f"),
+            _texts(snap.clearance_m, "%.4f"),
+            _ages(snap.age_ns),
+            snap.source.tolist(),
+        )
+    ]
+
+
+def _rect_heads(x_edges_m: F64, y_edges_m: F64) -> list[str]:
+    xs, ys = x_edges_m.tolist(), y_edges_m.tolist()
+    return [
+        f'{{"row":{row},"column":{column},"x_start_m":{x0:.4f},"x_stop_m":{x1:.4f},'
+        f'"y_start_m":{y0:.4f},"y_stop_m":{y1:.4f},"state":"'
+        for row, (y0, y1) in enumerate(pairwise(ys))
+        for column, (x0, x1) in enumerate(pairwise(xs))
+    ]
+
+
+def _rect_sectors(snap: RectSnapshot, heads: Sequence[str]) -> list[str]:
+    names = _source_names(snap.sources)
+    return [
+        f'{head}{_STATES[state]}","x_m":{x},"y_m":{y},"distance_m":{distance},"age_s":{age},"source":{names[source]}}}'
+        for head, state, x, y, distance, age, source in zip(
+            heads,
+            snap.state.ravel().tolist(),
+            _texts(snap.x_m.ravel(), "%.4f"),
+            _texts(snap.y_m.ravel(), "%.4f"),
+            _texts(np.hypot(snap.x_m, snap.y_m).ravel(), "%.4f"),
+            _ages(snap.age_ns.ravel()),
+            snap.source.ravel().tolist(),
+        )
+    ]
+
+
+def _source_names(sources: Sequence[str]) -> list[str]:
+    """JSON text by source index; the last entry, which index -1 finds, is null."""
+    return [*(json.dumps(name) for name in sources), "null"]
+
+
+def _texts(values: F64, layout: str) -> list[str]:
+    return [layout % value if value - value == 0.0 else "null" for value in values.tolist()]  # inf, NaN: null
+
+
+def _ages(age_ns: I64) -> list[str]:
+    return ["%.3f" % (age / _NANOS) if age >= 0 else "null" for age in age_ns.tolist()]

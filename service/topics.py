@@ -1,0 +1,264 @@
+"""The table of every Zenoh key: payload, encoding, rate, priority, cache, meaning. docs/keys.md is made from it.
+
+Keys stand below a base, `robots/<id>` by default. Names in angle brackets come from the configuration and match
+`[a-z0-9_-]+`. Nothing here needs Zenoh: the session file turns the words into Zenoh's values.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import Enum
+
+JSON_SECTORS = "application/json;umfeld.sectors.v1"
+JSON_RANGES = "application/json;umfeld.ranges.v1"
+JSON_HEALTH = "application/json;umfeld.health.v1"
+JSON_INFO = "application/json;umfeld.info.v1"
+JSON_GRID = "application/json;umfeld.grid.v1"
+JSON_REPLY = "application/json;umfeld.reply.v1"
+
+_CHUNK = re.compile(r"[a-z0-9_-]+\Z")
+
+
+class Priority(Enum):
+    """Zenoh's priorities by name, most urgent first."""
+
+    INTERACTIVE_HIGH = "INTERACTIVE_HIGH"
+    INTERACTIVE_LOW = "INTERACTIVE_LOW"
+    DATA_HIGH = "DATA_HIGH"
+    DATA = "DATA"
+    DATA_LOW = "DATA_LOW"
+    BACKGROUND = "BACKGROUND"
+
+
+class Lane(Enum):
+    """Which thread sends a key: small and urgent things never wait for a grid."""
+
+    STREAM = "stream"
+    MAP = "map"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One row of the table.
+
+    pattern: below the base, names in angle brackets.  payload: ROS 2 type or JSON schema name.  cached: a late
+    AdvancedSubscriber receives the last value at once.  every_value: values queue up in order (a bounded queue)
+    instead of the newest replacing the one before it.
+    """
+
+    pattern: str
+    payload: str
+    encoding: str
+    rate: str
+    meaning: str
+    priority: Priority = Priority.DATA
+    express: bool = False
+    cached: bool = False
+    lane: Lane = Lane.STREAM
+    every_value: bool = False
+
+    @property
+    def is_cdr(self) -> bool:
+        """The payload is a ROS 2 message."""
+        return self.encoding.startswith("application/cdr")
+
+    def matches(self, suffix: str) -> bool:
+        """Whether a key below the base belongs to this row."""
+        return _pattern_regex(self.pattern).fullmatch(suffix) is not None
+
+
+def _pattern_regex(pattern: str) -> re.Pattern[str]:
+    parts = ("[a-z0-9_-]+" if part.startswith("<") else re.escape(part) for part in pattern.split("/"))
+    return re.compile("/".join(parts))
+
+
+def cdr(ros_type: str) -> str:
+    """The Zenoh encoding of a ROS 2 message, e.g. application/cdr;sensor_msgs/msg/LaserScan."""
+    return f"application/cdr;{ros_type}"
+
+
+LASER_SCAN = "sensor_msgs/msg/LaserScan"
+RANGE = "sensor_msgs/msg/Range"
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+GRID = "nav_msgs/msg/OccupancyGrid"
+GRID_UPDATE = "map_msgs/msg/OccupancyGridUpdate"
+TF = "tf2_msgs/msg/TFMessage"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+
+SCAN = Topic(
+    "scan/<sensor>",
+    LASER_SCAN,
+    cdr(LASER_SCAN),
+    "as measured",
+    "One sweep of a laser, in the frame named like the sensor.",
+    Priority.INTERACTIVE_HIGH,
+    express=True,
+)
+RANGES = Topic(
+    "range/<sensor>",
+    "umfeld.ranges.v1",
+    JSON_RANGES,
+    "as measured",
+    "One round of an ultrasonic chain: every transducer with its pose, cone and range.",
+    Priority.INTERACTIVE_HIGH,
+    express=True,
+)
+RANGE_ONE = Topic(
+    "range/<sensor>/<transducer>",
+    RANGE,
+    cdr(RANGE),
+    "as measured",
+    "The same, one transducer a key (numbered from 1 in the order of the chain), as ROS 2 knows it.",
+    Priority.INTERACTIVE_HIGH,
+    express=True,
+)
+POLAR = Topic(
+    "sectors/polar/<name>",
+    "umfeld.sectors.v1",
+    JSON_SECTORS,
+    "per reading, 10 to 40 Hz",
+    "A polar sector map: nearest obstacle, state and age of every wedge of bearings.",
+    Priority.INTERACTIVE_HIGH,
+    express=True,
+)
+RECT = Topic(
+    "sectors/rect/<name>",
+    "umfeld.sectors.v1",
+    JSON_SECTORS,
+    "per reading, 10 to 40 Hz",
+    "A rectangular sector map: the same for every square around the vehicle.",
+    Priority.INTERACTIVE_HIGH,
+    express=True,
+)
+POSE_KEY = Topic(
+    "pose",
+    POSE,
+    cdr(POSE),
+    "10 to 40 Hz",
+    "The vehicle in the map frame.",
+    Priority.DATA_HIGH,
+)
+ODOM = Topic(
+    "odom",
+    ODOMETRY,
+    cdr(ODOMETRY),
+    "as measured",
+    "The vehicle in the odom frame, and its speed.",
+    Priority.DATA_HIGH,
+)
+TF_KEY = Topic(
+    "tf",
+    TF,
+    cdr(TF),
+    "with pose and odom",
+    "Moving transforms: map to odom, odom to base_link.",
+    Priority.DATA_HIGH,
+    every_value=True,
+)
+TF_STATIC = Topic(
+    "tf/static",
+    TF,
+    cdr(TF),
+    "on change",
+    "Fixed transforms: base_link to every sensor.",
+    Priority.DATA,
+    cached=True,
+)
+MAP_GRID = Topic(
+    "map/grid",
+    GRID,
+    cdr(GRID),
+    "at most 1 Hz, on change",
+    "The whole occupancy grid. Attachment: its epoch.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
+MAP_GRID_UPDATE = Topic(
+    "map/grid/update",
+    GRID_UPDATE,
+    cdr(GRID_UPDATE),
+    "at most 5 Hz, pieces of at most 32 KB",
+    "A changed rectangle. Attachment: the epoch of the full grid it changes, and its number.",
+    Priority.DATA,
+    lane=Lane.MAP,
+    every_value=True,
+)
+HEALTH = Topic(
+    "health",
+    DIAGNOSTICS,
+    cdr(DIAGNOSTICS),
+    "1 Hz and on change",
+    "State of the daemon and of every device, in words.",
+    cached=True,
+)
+HEALTH_JSON = Topic(
+    "health/json",
+    "umfeld.health.v1",
+    JSON_HEALTH,
+    "1 Hz and on change",
+    "The same as JSON, with every counter.",
+    cached=True,
+)
+HEALTH_ONE = Topic(
+    "health/<sensor>",
+    DIAGNOSTICS,
+    cdr(DIAGNOSTICS),
+    "1 Hz and on change",
+    "State of one device.",
+    cached=True,
+)
+INFO = Topic(
+    "info",
+    "umfeld.info.v1",
+    JSON_INFO,
+    "at start and on change",
+    "Who speaks: version, frames, sensors and where they sit, every key with its encoding and rate.",
+    Priority.DATA_LOW,
+    cached=True,
+)
+ALIVE = "alive"
+"""The liveliness token below the base: there while the daemon is, gone at once when it ends."""
+
+RPC = "@rpc"
+"""The chunk before the names of calls. `*` and `**` never match it, so a wildcard get() calls nothing."""
+
+TOPICS: tuple[Topic, ...] = (
+    SCAN,
+    RANGES,
+    RANGE_ONE,
+    POLAR,
+    RECT,
+    POSE_KEY,
+    ODOM,
+    TF_KEY,
+    TF_STATIC,
+    MAP_GRID,
+    MAP_GRID_UPDATE,
+    HEALTH,
+    HEALTH_JSON,  # before health/<sensor>: the exact key wins
+    HEALTH_ONE,
+    INFO,
+)
+
+RESERVED_SENSOR_NAMES = frozenset({"json"})
+"""A device of this name would collide with health/json."""
+
+
+def topic_of(suffix: str) -> Topic:
+    """The row of a key below the base; KeyError if the table has none."""
+    for topic in TOPICS:
+        if topic.matches(suffix):
+            return topic
+    raise KeyError(f"no topic for the key {suffix!r}: add it to service/topics.py")
+
+
+def check_base(base: str) -> str:
+    """The base as it is; ValueError names what is wrong with it."""
+    if not base or not all(_CHUNK.match(chunk) for chunk in base.split("/")):
+        raise ValueError(
+            f"key base {base!r}: chunks of lower-case letters, digits, _ and - joined by /, such as robots/artos"
+        )
+    return base
