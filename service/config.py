@@ -1,0 +1,662 @@
+"""The whole configuration: what may stand in umfeld.toml, checked as a whole, frozen afterwards.
+
+TOML, strict: an unknown key is a fault that names the nearest known one; all faults are reported at once, each one
+line with file, line, key and repair. Every value has a default and its unit in its name. A new device is one more
+small model in this file, told apart by its `driver`. Reference for users: docs/configuration.md.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from service.config_faults import Fault, faults_of, without_faults
+from service.config_files import DEFAULT_ENDPOINT, KeyPath, Layers, find_config, origin_of, read_layers
+from service.errors import WrongUsage
+
+Name = Annotated[str, Field(pattern=r"^[a-z0-9_-]+$", max_length=64)]
+Reference = Annotated[str, Field(pattern=r"^((lasers|sonars)\.)?[a-z0-9_-]+$", max_length=80)]
+Positive = Annotated[float, Field(gt=0)]
+Point = tuple[float, float]
+SENSOR_SECTIONS = ("lasers", "sonars")
+DEVICE_SECTIONS = (*SENSOR_SECTIONS, "wheels")
+
+
+class Section(BaseModel):
+    """Settings common to all tables: nothing unknown, nothing converted, nothing changed later."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+# --- the robot ----------------------------------------------------------------------------------------------------
+
+
+class Robot(Section):
+    """The vehicle: its name in every key, and its outline."""
+
+    id: Name = Field(default="robot", description="Name of the robot; all Zenoh keys begin with robots/<id>.")
+    footprint_m: tuple[Point, ...] = Field(
+        default=((0.25, 0.20), (-0.25, 0.20), (-0.25, -0.20), (0.25, -0.20)),
+        min_length=3,
+        max_length=64,
+        description="Outline as a polygon in the base frame (x forward, y left); every corner must be visible from the "
+        "base's origin.",
+    )
+
+    @field_validator("footprint_m")
+    @classmethod
+    def _seen_from_origin(cls, corners: tuple[Point, ...]) -> tuple[Point, ...]:
+        turns = [x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(corners, corners[1:] + corners[:1])]
+        if not (all(turn > 0 for turn in turns) or all(turn < 0 for turn in turns)):
+            raise ValueError(
+                "the outline must enclose the origin and every corner be visible from it; list the corners in order "
+                "around the robot, in the base frame"
+            )
+        return corners
+
+
+class Drive(Section):
+    """How wheel counts become motion."""
+
+    kind: Literal["differential"] = Field(default="differential", description="Kind of drive.")
+    source: Name | None = Field(
+        default=None, description="The [wheels.NAME] that counts; without one there is no odometry."
+    )
+    wheel_radius_left_m: Positive = Field(default=0.10, description="Rolling radius of the left wheel.")
+    wheel_radius_right_m: Positive = Field(default=0.10, description="Rolling radius of the right wheel.")
+    track_width_m: Positive = Field(default=0.50, description="Distance between the wheels' contact points.")
+    ticks_per_turn_left: float = Field(
+        default=4096.0,
+        description="Counts per turn of the left wheel, gear included; negative if they fall rolling forward.",
+    )
+    ticks_per_turn_right: float = Field(default=4096.0, description="The same for the right wheel.")
+    wheel_noise_m_per_sqrt_m: Positive = Field(
+        default=0.01,
+        description="Standard deviation of a wheel's travel after one metre; grows with the root of the distance.",
+    )
+    max_wheel_speed_m_s: Positive = Field(
+        default=5.0, description="Faster counting is dropped as a fault of the encoder."
+    )
+
+    @field_validator("ticks_per_turn_left", "ticks_per_turn_right")
+    @classmethod
+    def _not_zero(cls, ticks: float) -> float:
+        if ticks == 0:
+            raise ValueError(
+                "counts per turn cannot be 0; take them from the encoder's data sheet, times the gear ratio"
+            )
+        return ticks
+
+
+class Mount(Section):
+    """Where a sensor sits, in the base frame."""
+
+    x_m: float = Field(default=0.0, description="Forward of the base's origin.")
+    y_m: float = Field(default=0.0, description="Left of the base's origin.")
+    z_m: float = Field(default=0.0, description="Above the ground.")
+    yaw_deg: float = Field(
+        default=0.0, ge=-360, le=360, description="Direction it looks in, counter-clockwise from forward."
+    )
+    upside_down: bool = Field(default=False, description="Mounted head down: its bearings count the other way.")
+
+
+class PlanePose(Section):
+    """The pose of a virtual sensor in the base frame."""
+
+    x_m: float = Field(default=0.0, description="Forward of the base's origin.")
+    y_m: float = Field(default=0.0, description="Left of the base's origin.")
+    yaw_deg: float = Field(default=0.0, ge=-360, le=360, description="Its x axis, counter-clockwise from forward.")
+
+
+# --- wires and devices ----------------------------------------------------------------------------------------------
+
+
+class CanBus(Section):
+    """A CAN bus, through python-can."""
+
+    interface: Literal["socketcan", "slcan", "virtual"] = Field(
+        default="socketcan",
+        description="socketcan: a CAN card; slcan: an adapter on a serial port; virtual: inside a process.",
+    )
+    channel: str = Field(
+        default="can0", min_length=1, description="Interface name (can0) or the adapter's serial port."
+    )
+    bitrate_bps: Literal[10000, 20000, 50000, 100000, 125000, 250000, 500000, 1000000] = Field(
+        default=1000000, description="Bus speed; for socketcan it is set by the system, not here."
+    )
+
+
+class Device(Section):
+    """What every device has: which wire it is on and what it claims there."""
+
+    def serial_port(self) -> str | None:
+        """The serial port the device has for itself."""
+        return getattr(self, "port", None)
+
+    def can_bus(self) -> str | None:
+        """The [can.NAME] the device is on."""
+        return getattr(self, "can", None)
+
+    def can_ids(self) -> frozenset[int]:
+        """The 11-bit ids that belong to the device alone on its bus."""
+        return frozenset()
+
+
+class HokuyoLaser(Device):
+    """Hokuyo laser rangefinder, SCIP 2.x (URG-04LX, UTM-30LX and kin), on USB or RS-232."""
+
+    driver: Literal["hokuyo"]
+    port: str = Field(min_length=1, description="Serial port, best by a stable name: /dev/serial/by-id/...")
+    baud_bps: int = Field(
+        default=115200, ge=1200, le=4000000, description="Line speed on RS-232; without meaning on USB."
+    )
+    intensity: bool = Field(default=False, description="Ask for intensities as well (UTM-30LX and kin).")
+    mount: Mount = Field(default=Mount(), description="Where the laser sits.")
+    range_max_m: Positive | None = Field(
+        default=None, description="Ignore echoes beyond; default: the device's own limit."
+    )
+
+
+LaserDevice = Annotated[HokuyoLaser, Field(description="A laser rangefinder.")]
+
+
+class Transducer(Section):
+    """One transducer of an ultrasonic chain."""
+
+    channel: int = Field(ge=1, le=64, description="Number printed on the board, from 1.")
+    x_m: float = Field(default=0.0, description="Forward of the base's origin.")
+    y_m: float = Field(default=0.0, description="Left of the base's origin.")
+    z_m: float = Field(default=0.0, description="Above the ground.")
+    yaw_deg: float = Field(default=0.0, ge=-360, le=360, description="Direction it looks in.")
+
+
+class UsBoardSonars(Device):
+    """Neobotix USBoard-USS5, an ultrasonic chain of up to 16 transducers, on CAN."""
+
+    driver: Literal["usboard"]
+    can: Name = Field(description="The [can.NAME] it is on.")
+    base_id: int = Field(
+        default=0x400, ge=0, le=0x7EF, description="First of its 17 CAN ids; second board usually 0x420."
+    )
+    sending: Literal["request", "automatic"] = Field(
+        default="request", description="request: we ask for each round; automatic: the board sends by itself."
+    )
+    period_ms: int = Field(default=200, ge=40, le=2000, description="Time between two rounds.")
+    cone_deg: float = Field(default=30.0, gt=0, le=120, description="Full opening angle of a transducer.")
+    range_min_m: float = Field(default=0.2, ge=0, description="Nearest distance a transducer measures.")
+    range_max_m: Positive = Field(default=3.0, description="Farther echoes count as nothing seen.")
+    transducers: tuple[Transducer, ...] = Field(default=(), max_length=16, description="The connected ones.")
+
+    def can_ids(self) -> frozenset[int]:
+        """Command id, answers and measuring groups: base to base + 10h."""
+        return frozenset(range(self.base_id, self.base_id + 0x11))
+
+    @model_validator(mode="after")
+    def _sensible(self) -> UsBoardSonars:
+        channels = [transducer.channel for transducer in self.transducers]
+        for channel in channels:
+            if channel > 16:
+                raise ValueError(f"a USBoard has channels 1 to 16, not {channel}")
+            if channels.count(channel) > 1:
+                raise ValueError(f"channel {channel} is given to two transducers; each has a channel of its own")
+        if self.range_min_m >= self.range_max_m:
+            raise ValueError("range_min_m must be below range_max_m")
+        return self
+
+
+SonarDevice = Annotated[UsBoardSonars, Field(description="An ultrasonic chain.")]
+
+
+class Cia406Wheels(Device):
+    """Two CANopen encoders (CiA 406), one a wheel, sampled together by SYNC."""
+
+    driver: Literal["cia406"]
+    can: Name = Field(description="The [can.NAME] they are on.")
+    node_left: int = Field(default=0x20, ge=1, le=127, description="Node id of the left wheel's encoder.")
+    node_right: int = Field(default=0x21, ge=1, le=127, description="Node id of the right wheel's encoder.")
+    period_ms: int = Field(default=10, ge=5, le=200, description="Time between two SYNC messages, that is two samples.")
+
+    def can_ids(self) -> frozenset[int]:
+        """The predefined connection set of both nodes; SYNC and NMT are shared by all."""
+        bases = (0x080, 0x180, 0x280, 0x580, 0x600, 0x700)
+        return frozenset(base + node for base in bases for node in (self.node_left, self.node_right))
+
+    @model_validator(mode="after")
+    def _two_nodes(self) -> Cia406Wheels:
+        if self.node_left == self.node_right:
+            raise ValueError("node_left and node_right are the same; each encoder has a node id of its own")
+        return self
+
+
+WheelDevice = Annotated[Cia406Wheels, Field(description="The encoders of both wheels.")]
+
+
+# --- maps -----------------------------------------------------------------------------------------------------------
+
+
+class PolarSectorMap(Section):
+    """A polar sector map: per wedge of bearings the nearest obstacle and what is known."""
+
+    sources: tuple[Reference, ...] = Field(
+        min_length=1, description="Lasers and sonars that feed it; lasers.NAME or sonars.NAME where both have the name."
+    )
+    sector_deg: float = Field(default=5.0, gt=0, le=180, description="Width of a sector.")
+    start_deg: float = Field(default=-120.0, ge=-360, le=360, description="Where the first sector begins.")
+    stop_deg: float = Field(default=120.0, ge=-360, le=360, description="Where the last one ends.")
+    pose: PlanePose = Field(default=PlanePose(), description="The virtual sensor in the base frame.")
+
+    @model_validator(mode="after")
+    def _whole_sectors(self) -> PolarSectorMap:
+        span = self.stop_deg - self.start_deg
+        if not 0 < span <= 360:
+            raise ValueError("stop_deg must lie above start_deg, by at most 360")
+        count = span / self.sector_deg
+        if abs(count - round(count)) > 1e-6:
+            raise ValueError(f"{span:g} degrees are not a whole number of sectors of {self.sector_deg:g}")
+        return self
+
+
+class RectSectorMap(Section):
+    """A rectangular sector map around the robot: per square the nearest obstacle and what is known."""
+
+    sources: tuple[Reference, ...] = Field(
+        min_length=1, description="Lasers and sonars that feed it; lasers.NAME or sonars.NAME where both have the name."
+    )
+    size_m: tuple[Positive, Positive] = Field(
+        default=(4.0, 4.0), description="Extent along x and y, centred on the pose."
+    )
+    sector_m: Positive = Field(default=0.25, description="Edge of a sector.")
+    pose: PlanePose = Field(default=PlanePose(), description="The virtual sensor in the base frame.")
+
+    @model_validator(mode="after")
+    def _whole_sectors(self) -> RectSectorMap:
+        for size in self.size_m:
+            count = size / self.sector_m
+            if abs(count - round(count)) > 1e-6:
+                raise ValueError(f"{size:g} m are not a whole number of sectors of {self.sector_m:g} m")
+        if math.prod(self.size_m) / self.sector_m**2 > 40000:
+            raise ValueError("more than 40000 sectors; take a larger sector_m or a smaller size_m")
+        return self
+
+
+class SectorMaps(Section):
+    """All sector maps by name."""
+
+    polar: dict[Name, PolarSectorMap] = Field(default={}, description="Polar sector maps.")
+    rect: dict[Name, RectSectorMap] = Field(default={}, description="Rectangular sector maps.")
+
+
+class Grid(Section):
+    """The occupancy grid of the whole building, fixed in the map frame."""
+
+    enabled: bool = Field(default=True, description="Keep it.")
+    resolution_m: float = Field(default=0.05, ge=0.005, le=1.0, description="Edge of a cell.")
+    model: Literal["counters", "log-odds"] = Field(default="counters", description="What a cell remembers.")
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Sensors that draw it; default: all.")
+    publish_period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two whole grids.")
+    update_period_s: float = Field(default=0.2, ge=0.2, le=3600, description="Shortest time between two updates.")
+
+
+class LocalGrid(Section):
+    """The occupancy grid around the robot, which rolls with it: key map/local."""
+
+    enabled: bool = Field(default=False, description="Keep it.")
+    size_m: float = Field(default=8.0, gt=0, le=200, description="Edge of the square it covers.")
+    resolution_m: float = Field(default=0.05, ge=0.005, le=1.0, description="Edge of a cell.")
+    model: Literal["counters", "log-odds"] = Field(default="counters", description="What a cell remembers.")
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Sensors that draw it; default: all.")
+
+
+class Artos(Section):
+    """The two-step map of ARTOS from polar sector maps to a robot-centred grid: key map/artos."""
+
+    enabled: bool = Field(default=False, description="Keep it.")
+    size_m: float = Field(default=8.0, gt=0, le=100, description="Edge of the square it covers.")
+    resolution_m: float = Field(default=0.1, ge=0.01, le=1.0, description="Edge of a cell.")
+    sources: tuple[Name, ...] = Field(default=(), description="The [sectors.polar.NAME] it is made from; default: all.")
+    period_s: float = Field(default=0.2, ge=0.05, le=10, description="Time between two updates.")
+
+
+class Alignment(Section):
+    """How long readings wait for each other."""
+
+    odometry_wait_ms: int = Field(
+        default=500,
+        ge=20,
+        le=5000,
+        description="A scan waits this long for odometry that covers it, then it is dropped.",
+    )
+    odometry_memory_s: float = Field(default=30.0, ge=1, le=600, description="How far back poses are remembered.")
+
+
+# --- around the maps --------------------------------------------------------------------------------------------------
+
+
+class Tls(Section):
+    """Certificates for listening beyond this machine."""
+
+    root_ca_certificate: str = Field(min_length=1, description="File: who signed the certificates we accept.")
+    listen_certificate: str = Field(min_length=1, description="File: our certificate.")
+    listen_private_key: str = Field(min_length=1, description="File: its key.")
+    mutual: bool = Field(default=True, description="Ask clients for a certificate too.")
+
+
+class Network(Section):
+    """The Zenoh router inside the daemon."""
+
+    listen: tuple[str, ...] = Field(
+        default=(DEFAULT_ENDPOINT,),
+        min_length=1,
+        description="Where clients connect. Anything but loopback and unix sockets needs tls/ and [network.tls].",
+    )
+    connect: tuple[str, ...] = Field(default=(), description="Other routers to link to, for example a fleet's.")
+    tls: Tls | None = Field(default=None, description="Certificates; needed for tls/ endpoints.")
+    config: str | None = Field(
+        default=None, description="File (JSON5) with further Zenoh settings, for example access rules."
+    )
+
+    @field_validator("listen", "connect")
+    @classmethod
+    def _endpoints(cls, endpoints: tuple[str, ...]) -> tuple[str, ...]:
+        for endpoint in endpoints:
+            protocol, slash, address = endpoint.partition("/")
+            if protocol not in ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream") or not slash or not address:
+                raise ValueError(f"{endpoint!r} is not an endpoint; write it like {DEFAULT_ENDPOINT}")
+        return endpoints
+
+    @model_validator(mode="after")
+    def _closed_to_strangers(self) -> Network:
+        for endpoint in (*self.listen, *self.connect):
+            if endpoint.startswith(("tls/", "quic/")) and self.tls is None:
+                raise ValueError(f"{endpoint} needs certificates; add [network.tls], see deploy/ for an example")
+        for endpoint in self.listen:
+            if not is_local(endpoint) and not endpoint.startswith(("tls/", "quic/")):
+                port = endpoint.rpartition(":")[2]
+                raise ValueError(
+                    f"{endpoint} would be open to everyone on the network; listen on tcp/127.0.0.1:{port}, or on tls/ "
+                    "with [network.tls]"
+                )
+        return self
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether only this machine reaches an endpoint."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol == "unixsock-stream":
+        return True
+    host = address.partition("#")[0].partition("?")[0].rpartition(":")[0]
+    return host in ("localhost", "[::1]") or (host.startswith("127.") and host.replace(".", "").isdigit())
+
+
+class Ros(Section):
+    """The same data for an unmodified ROS 2 system with rmw_zenoh."""
+
+    enabled: bool = Field(default=False, description="Publish under ROS 2 names and tokens as well.")
+    distro: Literal["humble", "iron", "jazzy", "kilted", "lyrical", "rolling"] = Field(
+        default="jazzy", description="Whose type hashes to use."
+    )
+    domain_id: int = Field(default=0, ge=0, le=232, description="ROS_DOMAIN_ID.")
+
+
+class Store(Section):
+    """The map on disk."""
+
+    enabled: bool = Field(default=True, description="Keep the map across restarts.")
+    path: str | None = Field(
+        default=None, description="The map's file; default: ROBOT.umfeld in $STATE_DIRECTORY or ~/.local/share/umfeld."
+    )
+    snapshot_period_s: float = Field(
+        default=5.0, ge=0.5, le=3600, description="At most this much is lost when power fails."
+    )
+
+
+class Log(Section):
+    """What is written to standard error."""
+
+    level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="Least weight that is written."
+    )
+
+
+class Recording(Section):
+    """Raw bytes and everything published, as MCAP."""
+
+    enabled: bool = Field(default=False, description="Record from the first byte.")
+    directory: str = Field(default="~/.local/share/umfeld/recordings", description="Where recordings go.")
+    max_mb: Positive = Field(default=1024.0, description="A recording ends here.")
+
+
+class Config(Section):
+    """umfeld.toml as a whole."""
+
+    robot: Robot = Field(default=Robot(), description="The vehicle.")
+    drive: Drive = Field(default=Drive(), description="How wheel counts become motion.")
+    can: dict[Name, CanBus] = Field(default={}, description="CAN buses by name.")
+    lasers: dict[Name, LaserDevice] = Field(default={}, description="Laser rangefinders by name.")
+    sonars: dict[Name, SonarDevice] = Field(default={}, description="Ultrasonic chains by name.")
+    wheels: dict[Name, WheelDevice] = Field(default={}, description="Wheel encoders by name.")
+    sectors: SectorMaps = Field(default=SectorMaps(), description="Sector maps.")
+    grid: Grid = Field(default=Grid(), description="The grid of the whole building.")
+    local_grid: LocalGrid = Field(default=LocalGrid(), description="The grid around the robot.")
+    artos: Artos = Field(default=Artos(), description="The ARTOS two-step map.")
+    alignment: Alignment = Field(default=Alignment(), description="How long readings wait for each other.")
+    network: Network = Field(default=Network(), description="The Zenoh router.")
+    ros: Ros = Field(default=Ros(), description="ROS 2 beside our own keys.")
+    store: Store = Field(default=Store(), description="The map on disk.")
+    log: Log = Field(default=Log(), description="What is written to standard error.")
+    recording: Recording = Field(default=Recording(), description="Raw bytes and everything published.")
+
+    def devices(self) -> Iterator[tuple[str, str, Device]]:
+        """(section, name, device) of every device, in a fixed order."""
+        for section in DEVICE_SECTIONS:
+            for name, device in sorted(getattr(self, section).items()):
+                yield section, name, device
+
+    def source_name(self, section: str, name: str) -> str:
+        """The one name of a device in keys and reports: its own, with its section before it if an earlier one has it.
+
+        lasers come before sonars, sonars before wheels: with [lasers.front] and [sonars.front] these are `front` and
+        `sonars-front`.
+        """
+        earlier = {"lasers": (), "sonars": ("lasers",), "wheels": ("lasers", "sonars")}[section]
+        return f"{section}-{name}" if any(name in getattr(self, other) for other in earlier) else name
+
+    def resolve(self, reference: str) -> tuple[str, str]:
+        """(section, name) of a sector map's or grid's source; a bare name means the laser if there is one.
+
+        Raises KeyError if there is no such sensor.
+        """
+        section, dot, name = reference.rpartition(".")
+        for candidate in (section,) if dot else SENSOR_SECTIONS:
+            if name in getattr(self, candidate):
+                return candidate, name
+        raise KeyError(reference)
+
+    def store_path(self) -> Path:
+        """The map's file."""
+        if self.store.path is not None:
+            return Path(self.store.path).expanduser()
+        state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+        return (Path(state) if state else Path.home() / ".local/share/umfeld") / f"{self.robot.id}.umfeld"
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """A valid configuration, where each value came from, and the files that were read."""
+
+    config: Config
+    origins: Mapping[KeyPath, str]
+    files: tuple[Path, ...]
+
+    def origin(self, path: KeyPath) -> str:
+        """`default`, `FILE:LINE`, `environment NAME` or `--set`."""
+        return origin_of(self.origins, path)
+
+
+def load(
+    path: Path | None = None, *, settings: Sequence[str] = (), environment: Mapping[str, str] | None = None
+) -> Loaded:
+    """Find, read, merge and check the configuration.
+
+    path: the file, or None to look for one (docs/configuration.md).  settings: `KEY=VALUE` from the command line.
+    Raises WrongUsage with one line per fault, all of them at once.
+    """
+    layers = read_layers(find_config(path), environment=environment, settings=settings)
+    return Loaded(check(layers), layers.origins, layers.files)
+
+
+def check(layers: Layers) -> Config:
+    """Validate merged tables; raises WrongUsage with one line per fault."""
+    data = _tuples(layers.data)
+    config, faults = _parse(data)
+    faults.extend(_cross_faults(config, data))
+    if faults:
+        faults.sort(key=lambda fault: _in_file_order(origin_of(layers.origins, fault.path)))
+        lines = (f"{_where(layers.origins, fault.path)}{'.'.join(fault.path)}: {fault.text}" for fault in faults)
+        raise WrongUsage(*dict.fromkeys(lines))
+    return config
+
+
+def _where(origins: Mapping[KeyPath, str], path: KeyPath) -> str:
+    origin = origin_of(origins, path)
+    return "" if origin == "default" else f"{origin}: "
+
+
+def _in_file_order(origin: str) -> tuple[str, int]:
+    file, _, line = origin.rpartition(":")
+    return (file, int(line)) if line.isdecimal() else (origin, 0)
+
+
+def _parse(data: dict[str, Any]) -> tuple[Config, list[Fault]]:
+    """The configuration without its faulty parts, and the faults; so that what is left can be checked as well."""
+    faults: list[Fault] = []
+    while True:
+        try:
+            return Config.model_validate(data), faults
+        except ValidationError as error:
+            found = faults_of(error, Config, data)
+            faults.extend(fault for fault in found if fault not in faults)
+            smaller = without_faults(data, found)
+            if smaller == data:
+                return Config(), faults
+            data = smaller
+
+
+def _tuples(value: Any) -> Any:
+    """Arrays as tuples, which frozen models keep."""
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+# --- what several tables must agree on --------------------------------------------------------------------------------
+
+
+def _cross_faults(config: Config, data: Mapping[str, Any]) -> list[Fault]:
+    """References that lead nowhere, and things claimed twice.
+
+    Looked for in the raw tables, where tables that are faulty otherwise still stand: one fault does not hide another.
+    """
+    return [
+        *_reference_faults(data),
+        *_port_faults(data),
+        *_can_id_faults(config),
+        *_unused_faults(config, data),
+    ]
+
+
+def _table(data: Mapping[str, Any], *keys: str) -> Mapping[str, Any]:
+    table: Any = data
+    for key in keys:
+        table = table.get(key) if isinstance(table, Mapping) else None
+    return table if isinstance(table, Mapping) else {}
+
+
+def _tables(data: Mapping[str, Any], *keys: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    return ((name, each) for name, each in sorted(_table(data, *keys).items()) if isinstance(each, Mapping))
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    return tuple(each for each in value if isinstance(each, str)) if isinstance(value, tuple) else ()
+
+
+def _missing(path: KeyPath, name: str, section: str, data: Mapping[str, Any]) -> Fault:
+    there = ", ".join(sorted(_table(data, *section.split("."))))
+    repair = f"add [{section}.{name}], or name one of: {there}" if there else f"add [{section}.{name}]"
+    return Fault(path, f"there is no [{section}.{name}]; {repair}")
+
+
+def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
+    source = _table(data, "drive").get("source")
+    if isinstance(source, str) and source not in _table(data, "wheels"):
+        yield _missing(("drive", "source"), source, "wheels", data)
+    for section in DEVICE_SECTIONS:
+        for name, device in _tables(data, section):
+            bus = device.get("can")
+            if isinstance(bus, str) and bus not in _table(data, "can"):
+                yield _missing((section, name, "can"), bus, "can", data)
+    for path, table in (
+        *((("sectors", "polar", name), table) for name, table in _tables(data, "sectors", "polar")),
+        *((("sectors", "rect", name), table) for name, table in _tables(data, "sectors", "rect")),
+        (("grid",), _table(data, "grid")),
+        (("local_grid",), _table(data, "local_grid")),
+    ):
+        for reference in _texts(table.get("sources")):
+            section, dot, name = reference.rpartition(".")
+            if not any(name in _table(data, each) for each in ((section,) if dot else SENSOR_SECTIONS)):
+                known = [f"{each}.{one}" for each in SENSOR_SECTIONS for one in sorted(_table(data, each))]
+                text = f"there is no sensor {reference}; name one of: {', '.join(known) or '(none yet)'}"
+                yield Fault((*path, "sources"), text)
+    for name in _texts(_table(data, "artos").get("sources")):
+        if name not in _table(data, "sectors", "polar"):
+            yield _missing(("artos", "sources"), name, "sectors.polar", data)
+
+
+def _port_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
+    taken: dict[str, str] = {}
+    claims = [
+        ((section, name, key), table.get(key))
+        for section, key in (*((each, "port") for each in DEVICE_SECTIONS), ("can", "channel"))
+        for name, table in _tables(data, section)
+    ]
+    for path, port in claims:
+        if not isinstance(port, str):
+            continue
+        real = os.path.realpath(port) if port.startswith("/") else port
+        if real in taken:
+            yield Fault(path, f"{port} is already used by {taken[real]}; each wire has a port of its own")
+        else:
+            taken[real] = ".".join(path[:-1])
+
+
+def _can_id_faults(config: Config) -> Iterator[Fault]:
+    taken: dict[tuple[str, int], str] = {}
+    for section, name, device in config.devices():
+        bus = device.can_bus()
+        if bus is None:
+            continue
+        clashes = sorted(can_id for can_id in device.can_ids() if (bus, can_id) in taken)
+        if clashes:
+            other = taken[bus, clashes[0]]
+            yield Fault(
+                (section, name),
+                f"uses CAN id 0x{clashes[0]:03X} on [can.{bus}] like {other}; give one other ids (base_id, node_left ...)",
+            )
+        taken.update({(bus, can_id): f"{section}.{name}" for can_id in device.can_ids()})
+
+
+def _unused_faults(config: Config, data: Mapping[str, Any]) -> Iterator[Fault]:
+    """What was written down to be used and cannot be."""
+    for name in config.wheels:
+        if config.drive.source is None and "source" not in _table(data, "drive"):
+            yield Fault(
+                ("wheels", name), f'no drive uses it; add source = "{name}" to [drive], with the wheels\' measures'
+            )
+    if config.artos.enabled and not _table(data, "sectors", "polar"):
+        yield Fault(("artos", "enabled"), "the ARTOS map is made from polar sector maps; add a [sectors.polar.NAME]")
