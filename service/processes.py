@@ -25,7 +25,7 @@ class Child:
     def last_lines(self, count: int = 5) -> str:
         """The end of its output, for an error message."""
         text = self.log.read_text(errors="replace") if self.log.exists() else ""
-        return "\n".join(line for line in text.splitlines() if line.strip())[-1500:].rsplit("\n", count)[-1]
+        return "\n".join([line for line in text.splitlines() if line.strip()][-count:])
 
 
 @dataclass(slots=True)
@@ -37,7 +37,7 @@ class Family:
     _files: list[IO[bytes]] = field(default_factory=list)
 
     def start(self, name: str, command: Sequence[str]) -> Child:
-        """Start a process in a session of its own: a Ctrl-C at the terminal reaches only us, and we end them in order."""
+        """Start a process in a session of its own: a terminal's Ctrl-C reaches only us, and we end them in order."""
         log = self.folder / f"{name}.log"
         file = log.open("wb")
         self._files.append(file)
