@@ -401,6 +401,14 @@ class HokuyoLaser:
         self._reboot_asked_ns: int | None = None
         self._last_command = b""
 
+    def link_lost(self, now_ns: int) -> None:
+        """The host's TCP connection ended: stop measuring and forget what was to be sent."""
+        if self.link == "tcp":
+            self._stop()
+            self._outgoing.clear()
+            self._wire_promised_ns = now_ns
+            self._buffer.clear()
+
     def trouble(self, status: str | None, now_ns: int) -> None:
         """Hardware trouble: a running stream ends with this status (50..97), BM answers 01. None: well again."""
         self._trouble = status

@@ -1,0 +1,486 @@
+"""Emulated devices on real wires: ptys under fixed names, a TCP port, or memory; and the loop that runs them.
+
+A link is the host's end of a wire: bytes in, bytes out, the host's line speed, and it can be pulled out and put back.
+A station is what the loop serves: a device on its link here, a whole CAN bus in slcan_hub.py. One thread serves all
+stations; others talk to it through `post`. The loop sleeps until a host sends something or a device has something due.
+
+A pty carries no modem lines and no pace of its own; the devices keep the wire's time. Its queue holds about 20 KB: what
+does not fit is dropped and counted, as an overrun would. The slave stays open here, or reads would fail between hosts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import queue
+import select
+import socket
+import struct
+import threading
+import time
+import tty
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from sim_devices.device import ByteDevice
+
+TCGETS2 = 0x802C542A
+TERMIOS2 = struct.Struct("4IB19s2I")  # flags, line discipline, control characters, input and output speed
+READ_SIZE = 65536
+HOKUYO_TCP_PORT = 10940
+IDLE_NS = 50_000_000  # longest sleep
+STEP_NS = 2_000_000  # step of a device that does not say when it wants the next one
+
+
+@dataclass(slots=True)
+class LinkCounters:
+    """What went over a link since it was made."""
+
+    received_bytes: int = 0
+    sent_bytes: int = 0
+    dropped_bytes: int = 0
+
+
+class Link(Protocol):
+    """The emulator's end of a wire."""
+
+    counters: LinkCounters
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the wire is plugged in."""
+
+    @property
+    def baud(self) -> int | None:
+        """The host's line speed; None where a link has none."""
+
+    def open(self) -> None:
+        """Plug it in, under the same name as before."""
+
+    def close(self) -> None:
+        """Pull it out: the host's end breaks."""
+
+    def files(self) -> list[int]:
+        """Descriptors that become readable when there is something to read."""
+
+    def read(self) -> bytes:
+        """What the host sent since the last call, without waiting."""
+
+    def write(self, data: bytes) -> int:
+        """Send without waiting; what does not fit is dropped and counted. Returns how many bytes went out."""
+
+
+class PtyLink:
+    """A pty published by a symbolic link, so that a replugged device comes back under its name.
+
+    path: the symbolic link, made with its folders and removed by close(). An existing symbolic link is replaced;
+    anything else there is left alone and raises FileExistsError.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.counters = LinkCounters()
+        self._master: int | None = None
+        self._slave: int | None = None
+        self.open()
+
+    @property
+    def is_open(self) -> bool:
+        return self._master is not None
+
+    @property
+    def baud(self) -> int | None:
+        if self._master is None:
+            return None
+        with contextlib.suppress(OSError):
+            speed: int = TERMIOS2.unpack(fcntl.ioctl(self._master, TCGETS2, bytes(TERMIOS2.size)))[-1]
+            return speed
+        return None
+
+    @property
+    def tty(self) -> str | None:
+        """The name of the terminal behind the symbolic link."""
+        return None if self._slave is None else os.ttyname(self._slave)
+
+    def open(self) -> None:
+        if self._master is not None:
+            return
+        if self.path.exists() and not self.path.is_symlink():
+            raise FileExistsError(f"{self.path} exists and is no link of ours; choose another folder")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)  # default settings echo: the emulator would hear itself
+        os.set_blocking(self._master, False)
+        fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(os.ttyname(self._slave))
+        fresh.replace(self.path)
+
+    def close(self) -> None:
+        if self._master is None or self._slave is None:
+            return
+        with contextlib.suppress(OSError):
+            if os.readlink(self.path) == os.ttyname(self._slave):
+                self.path.unlink()
+        os.close(self._slave)
+        os.close(self._master)  # hangs up: the host reads end of file or EIO
+        self._master = self._slave = None
+
+    def files(self) -> list[int]:
+        return [] if self._master is None else [self._master]
+
+    def read(self) -> bytes:
+        if self._master is None:
+            return b""
+        try:
+            data = os.read(self._master, READ_SIZE)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EIO):
+                return b""
+            raise
+        self.counters.received_bytes += len(data)
+        return data
+
+    def write(self, data: bytes) -> int:
+        sent = 0
+        if self._master is not None:
+            try:
+                while sent < len(data):
+                    sent += os.write(self._master, data[sent:])
+            except OSError as error:
+                if error.errno not in (errno.EAGAIN, errno.EIO):
+                    raise
+        self.counters.sent_bytes += sent
+        self.counters.dropped_bytes += len(data) - sent
+        return sent
+
+
+class TcpLink:
+    """A device that listens on a TCP port of the loopback interface; one host at a time, as such devices do.
+
+    port: 0 takes a free one, kept over a replug.
+    """
+
+    def __init__(self, port: int = HOKUYO_TCP_PORT, host: str = "127.0.0.1") -> None:
+        self.host = host
+        self.port = port
+        self.counters = LinkCounters()
+        self.baud: int | None = None
+        self.hosts_lost = 0
+        self._listener: socket.socket | None = None
+        self._client: socket.socket | None = None
+        self.open()
+
+    @property
+    def is_open(self) -> bool:
+        return self._listener is not None
+
+    def open(self) -> None:
+        if self._listener is not None:
+            return
+        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((self.host, self.port))
+        listener.listen(1)
+        listener.setblocking(False)
+        self.port = listener.getsockname()[1]
+        self._listener = listener
+
+    def close(self) -> None:
+        self._lose_client()
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+
+    def files(self) -> list[int]:
+        return [end.fileno() for end in (self._listener, self._client) if end is not None]
+
+    def read(self) -> bytes:
+        self._welcome()
+        if self._client is None:
+            return b""
+        try:
+            data = self._client.recv(READ_SIZE)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            self._lose_client()
+        self.counters.received_bytes += len(data)
+        return data
+
+    def write(self, data: bytes) -> int:
+        sent = 0
+        if self._client is not None:
+            try:
+                while sent < len(data):
+                    sent += self._client.send(data[sent:])
+            except BlockingIOError:
+                pass
+            except OSError:
+                self._lose_client()
+        self.counters.sent_bytes += sent
+        self.counters.dropped_bytes += len(data) - sent
+        return sent
+
+    def _welcome(self) -> None:
+        if self._listener is None:
+            return
+        with contextlib.suppress(OSError):
+            client, _ = self._listener.accept()
+            if self._client is not None:
+                client.close()
+                return
+            client.setblocking(False)
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._client = client
+
+    def _lose_client(self) -> None:
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+            self.hosts_lost += 1
+
+
+class MemoryLink:
+    """A wire inside one process, for tests: `host_write` and `host_read` are the other end."""
+
+    def __init__(self, baud: int | None = None) -> None:
+        self.counters = LinkCounters()
+        self.baud = baud
+        self.is_open = True
+        self._to_device = bytearray()
+        self._to_host = bytearray()
+
+    def open(self) -> None:
+        self.is_open = True
+
+    def close(self) -> None:
+        self.is_open = False
+        self._to_device.clear()
+        self._to_host.clear()
+
+    def files(self) -> list[int]:
+        return []
+
+    def read(self) -> bytes:
+        data = bytes(self._to_device)
+        self._to_device.clear()
+        self.counters.received_bytes += len(data)
+        return data
+
+    def write(self, data: bytes) -> int:
+        if not self.is_open:
+            self.counters.dropped_bytes += len(data)
+            return 0
+        self._to_host += data
+        self.counters.sent_bytes += len(data)
+        return len(data)
+
+    def host_write(self, data: bytes) -> None:
+        """What the host sends. Raises BrokenPipeError while the wire is pulled out."""
+        if not self.is_open:
+            raise BrokenPipeError("the wire is unplugged")
+        self._to_device += data
+
+    def host_read(self) -> bytes:
+        """What has arrived at the host. Raises BrokenPipeError while the wire is pulled out."""
+        if not self.is_open:
+            raise BrokenPipeError("the wire is unplugged")
+        data = bytes(self._to_host)
+        self._to_host.clear()
+        return data
+
+
+class Station(Protocol):
+    """Something the loop serves: a device on its link, or a bus with all its members."""
+
+    def files(self) -> list[int]:
+        """Descriptors to wait for."""
+
+    def service(self, now_ns: int) -> int | None:
+        """Move bytes and step devices; returns when it wants to be served again, None: when something arrives."""
+
+    def plug(self, connected: bool, member: str = "") -> None:
+        """Put the wire in or pull it out. member: which wire, where a station has several."""
+
+    def close(self) -> None:
+        """Give back what it holds."""
+
+
+class DeviceStation:
+    """One serial or TCP device on its link.
+
+    A device with an attribute `plugged` (a fault wrapper) pulls its own wire by setting it False; one with `next_ns` is
+    served when it asks for it; one with `link_lost(now_ns)` is told when its TCP host went away.
+    """
+
+    def __init__(self, device: ByteDevice, link: Link) -> None:
+        self.device = device
+        self.link = link
+        self._wanted = True
+        self._hosts_lost = 0
+
+    def files(self) -> list[int]:
+        return self.link.files()
+
+    def plug(self, connected: bool, member: str = "") -> None:
+        self._wanted = connected
+
+    def service(self, now_ns: int) -> int | None:
+        self._follow_plug()
+        received = self.link.read() if self.link.is_open else b""
+        self._tell_loss(now_ns)
+        sent = self.device.step(now_ns, received, self.link.baud)
+        self._follow_plug()
+        if sent:
+            self.link.write(sent)
+        due_ns: int | None = getattr(self.device, "next_ns", now_ns + STEP_NS)
+        return due_ns
+
+    def close(self) -> None:
+        self.link.close()
+
+    def _follow_plug(self) -> None:
+        wanted = self._wanted and bool(getattr(self.device, "plugged", True))
+        if wanted and not self.link.is_open:
+            self.link.open()
+        elif not wanted and self.link.is_open:
+            self.link.close()
+
+    def _tell_loss(self, now_ns: int) -> None:
+        lost = int(getattr(self.link, "hosts_lost", 0))
+        if lost != self._hosts_lost:
+            self._hosts_lost = lost
+            tell = getattr(self.device, "link_lost", None)
+            if tell is not None:
+                tell(now_ns)
+
+
+class Attachment:
+    """All stations of one emulation and the loop that serves them.
+
+    clock: nanoseconds; by default the machine's monotonic clock.  speed: simulated seconds for each second of it.
+
+    Use it by hand in tests (`service(now_ns)`), run it in this thread (`run(until)`), or in one of its own
+    (`start()`, `stop()`). Everything but `post`, `plug`, `stop` and what they carry belongs to the loop's thread.
+    """
+
+    def __init__(self, *, clock: Callable[[], int] = time.monotonic_ns, speed: float = 1.0) -> None:
+        if not speed > 0:
+            raise ValueError("speed must be greater than 0")
+        self._clock = clock
+        self._speed = speed
+        self._origin_ns = clock()
+        self._stations: dict[str, Station] = {}
+        self._posted: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failure: BaseException | None = None
+
+    # -- building -----------------------------------------------------------------------------------------------------
+
+    def add(self, name: str, device: ByteDevice, link: Link) -> DeviceStation:
+        """Attach a serial or TCP device."""
+        station = DeviceStation(device, link)
+        self.add_station(name, station)
+        return station
+
+    def add_station(self, name: str, station: Station) -> None:
+        """Attach anything that can be served, such as a CAN bus."""
+        if name in self._stations:
+            raise ValueError(f"there is a station {name!r} already")
+        self._stations[name] = station
+
+    # -- from any thread ----------------------------------------------------------------------------------------------
+
+    def post(self, action: Callable[[], object]) -> None:
+        """Have the loop run something between two services."""
+        self._posted.put(action)
+        with contextlib.suppress(OSError):
+            os.write(self._wake_write, b"\0")
+
+    def plug(self, name: str, connected: bool, member: str = "") -> None:
+        """Pull out (False) or put back (True) a station's wire; takes effect at once, from any thread."""
+        station = self._stations[name]
+        self.post(lambda: station.plug(connected, member))
+
+    def unplug(self, name: str, member: str = "") -> None:
+        """Pull out a wire: its pty goes away with its name."""
+        self.plug(name, False, member)
+
+    def replug(self, name: str, member: str = "") -> None:
+        """Put the wire back: a new pty under the same name."""
+        self.plug(name, True, member)
+
+    # -- the loop -----------------------------------------------------------------------------------------------------
+
+    def now_ns(self) -> int:
+        """Simulated time: the clock's, run at `speed` from when this was made."""
+        now_ns = self._clock()
+        if self._speed == 1.0:
+            return now_ns
+        return self._origin_ns + round((now_ns - self._origin_ns) * self._speed)
+
+    def service(self, now_ns: int) -> int | None:
+        """Serve every station once; returns the earliest time any wants to be served again."""
+        while not self._posted.empty():
+            self._posted.get()()
+        due = [station.service(now_ns) for station in self._stations.values()]
+        return min((at_ns for at_ns in due if at_ns is not None), default=None)
+
+    def run(self, until: Callable[[], bool] | None = None) -> None:
+        """Serve in this thread until `until()` is true or stop() was called."""
+        while not self._ending.is_set() and not (until is not None and until()):
+            due_ns = self.service(self.now_ns())
+            self._wait(due_ns)
+
+    def start(self) -> Attachment:
+        """Serve in a thread of its own."""
+        self._thread = threading.Thread(target=self._run_guarded, name="attachment", daemon=True)
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """End the loop and pull out all wires. Raises what the loop's thread died of, if it did."""
+        self._ending.set()
+        self.post(lambda: None)
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+            self._thread = None
+        for station in self._stations.values():
+            station.close()
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+        if self._failure is not None:
+            raise self._failure
+
+    def __enter__(self) -> Attachment:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def _run_guarded(self) -> None:
+        try:
+            self.run()
+        except BaseException as error:
+            self._failure = error
+
+    def _wait(self, due_ns: int | None) -> None:
+        """Sleep until something arrives or is due."""
+        left_ns = IDLE_NS if due_ns is None else round((due_ns - self.now_ns()) / self._speed)
+        timeout_s = min(max(left_ns, 0), IDLE_NS) * 1e-9
+        files: Sequence[int] = [self._wake_read, *(file for one in self._stations.values() for file in one.files())]
+        ready, _, _ = select.select(files, [], [], timeout_s)
+        if self._wake_read in ready:
+            with contextlib.suppress(OSError):
+                os.read(self._wake_read, 4096)
