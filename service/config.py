@@ -151,7 +151,7 @@ class Device(Section):
 class HokuyoLaser(Device):
     """Hokuyo laser rangefinder, SCIP 2.x (URG-04LX, UTM-30LX and kin), on USB or RS-232."""
 
-    driver: Literal["hokuyo"]
+    driver: Literal["hokuyo"] = Field(description="Says that it is this kind of device.")
     port: str = Field(min_length=1, description="Serial port, best by a stable name: /dev/serial/by-id/...")
     baud_bps: int = Field(
         default=115200, ge=1200, le=4000000, description="Line speed on RS-232; without meaning on USB."
@@ -179,7 +179,7 @@ class Transducer(Section):
 class UsBoardSonars(Device):
     """Neobotix USBoard-USS5, an ultrasonic chain of up to 16 transducers, on CAN."""
 
-    driver: Literal["usboard"]
+    driver: Literal["usboard"] = Field(description="Says that it is this kind of device.")
     can: Name = Field(description="The [can.NAME] it is on.")
     base_id: int = Field(
         default=0x400, ge=0, le=0x7EF, description="First of its 17 CAN ids; second board usually 0x420."
@@ -216,7 +216,7 @@ SonarDevice = Annotated[UsBoardSonars, Field(description="An ultrasonic chain.")
 class Cia406Wheels(Device):
     """Two CANopen encoders (CiA 406), one a wheel, sampled together by SYNC."""
 
-    driver: Literal["cia406"]
+    driver: Literal["cia406"] = Field(description="Says that it is this kind of device.")
     can: Name = Field(description="The [can.NAME] they are on.")
     node_left: int = Field(default=0x20, ge=1, le=127, description="Node id of the left wheel's encoder.")
     node_right: int = Field(default=0x21, ge=1, le=127, description="Node id of the right wheel's encoder.")
@@ -474,7 +474,7 @@ class Config(Section):
         """
         section, dot, name = reference.rpartition(".")
         for candidate in (section,) if dot else SENSOR_SECTIONS:
-            if name in getattr(self, candidate):
+            if candidate in SENSOR_SECTIONS and name in getattr(self, candidate):
                 return candidate, name
         raise KeyError(reference)
 
@@ -517,15 +517,22 @@ def check(layers: Layers) -> Config:
     config, faults = _parse(data)
     faults.extend(_cross_faults(config, data))
     if faults:
-        faults.sort(key=lambda fault: _in_file_order(origin_of(layers.origins, fault.path)))
-        lines = (f"{_where(layers.origins, fault.path)}{'.'.join(fault.path)}: {fault.text}" for fault in faults)
+        places = layers.tables | layers.origins
+        located = [(_place(places, fault.path), fault) for fault in faults]
+        located.sort(key=lambda each: _in_file_order(each[0]))
+        lines = (": ".join(filter(None, (place, ".".join(fault.path), fault.text))) for place, fault in located)
         raise WrongUsage(*dict.fromkeys(lines))
     return config
 
 
-def _where(origins: Mapping[KeyPath, str], path: KeyPath) -> str:
-    origin = origin_of(origins, path)
-    return "" if origin == "default" else f"{origin}: "
+def _place(places: Mapping[KeyPath, str], path: KeyPath) -> str:
+    """Where a key stands, or the table around it, or the first key below it; empty if in no file."""
+    path = tuple(step.partition("[")[0] for step in path)
+    for length in range(len(path), 0, -1):
+        below = next((place for keys, place in places.items() if keys[:length] == path[:length]), None)
+        if found := places.get(path[:length], below):
+            return found
+    return ""
 
 
 def _in_file_order(origin: str) -> tuple[str, int]:
@@ -541,7 +548,8 @@ def _parse(data: dict[str, Any]) -> tuple[Config, list[Fault]]:
             return Config.model_validate(data), faults
         except ValidationError as error:
             found = faults_of(error, Config, data)
-            faults.extend(fault for fault in found if fault not in faults)
+            known = {fault.path for fault in faults}  # what was taken out is now missing: not a fault of its own
+            faults.extend(fault for fault in found if fault.path not in known)
             smaller = without_faults(data, found)
             if smaller == data:
                 return Config(), faults
@@ -646,7 +654,7 @@ def _can_id_faults(config: Config) -> Iterator[Fault]:
             other = taken[bus, clashes[0]]
             yield Fault(
                 (section, name),
-                f"uses CAN id 0x{clashes[0]:03X} on [can.{bus}] like {other}; give one other ids (base_id, node_left ...)",
+                f"uses CAN id 0x{clashes[0]:03X} on [can.{bus}] like {other}; give one other ids (base_id, node_...)",
             )
         taken.update({(bus, can_id): f"{section}.{name}" for can_id in device.can_ids()})
 

@@ -93,7 +93,7 @@ def _sentence(detail: Any, path: KeyPath, model: type[BaseModel], data: Mapping[
         return f"is {detail['input']!r}, must be {context['expected']}"
     if kind == "string_pattern_mismatch":
         return f"{detail['input']!r} is not a name; use lower case letters, digits, _ and -"
-    sentence = EXPECTED.get(kind, detail["msg"][0].lower() + detail["msg"][1:].replace("input should", "should"))
+    sentence = EXPECTED.get(kind) or detail["msg"].replace("Input should", "should")
     return f"is {_short(detail['input'])}, {sentence}"
 
 

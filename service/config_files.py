@@ -29,6 +29,7 @@ class Layers:
 
     data: dict[str, Any]
     origins: dict[KeyPath, str]
+    tables: dict[KeyPath, str]  # where each table begins
     files: tuple[Path, ...]
 
 
@@ -36,10 +37,12 @@ class Layers:
 class _Merge:
     data: dict[str, Any] = field(default_factory=dict)
     origins: dict[KeyPath, str] = field(default_factory=dict)
+    tables: dict[KeyPath, str] = field(default_factory=dict)
 
-    def add(self, table: Mapping[str, Any], origins: Mapping[KeyPath, str]) -> None:
+    def add(self, table: Mapping[str, Any], keys: Mapping[KeyPath, str], tables: Mapping[KeyPath, str]) -> None:
         _merge_into(self.data, table)
-        self.origins.update(origins)
+        self.origins.update(keys)
+        self.tables.update(tables)
 
 
 def find_config(given: Path | None, *, home: Path | None = None, here: Path | None = None) -> Path | None:
@@ -83,7 +86,7 @@ def read_layers(
         merge.add(*_single(tuple(key.strip().split(".")), text.strip(), "--set"))
     if faults:
         raise WrongUsage(*faults)
-    return Layers(merge.data, merge.origins, files)
+    return Layers(merge.data, merge.origins, merge.tables, files)
 
 
 def daemon_endpoint(path: Path | None) -> str:
@@ -99,7 +102,7 @@ def daemon_endpoint(path: Path | None) -> str:
 
 
 def origin_of(origins: Mapping[KeyPath, str], path: KeyPath) -> str:
-    """Where a value came from: its own origin, else that of the nearest table or array around it, else `default`."""
+    """Where a value came from: its own origin, else that of the array around it, else `default`."""
     for length in range(len(path), 0, -1):
         if path[:length] in origins:
             return origins[path[:length]]
@@ -113,7 +116,7 @@ def _files_of(path: Path | None) -> tuple[Path, ...]:
     return (path, *sorted(overlays.glob("*.toml"))) if overlays.is_dir() else (path,)
 
 
-def _read_file(path: Path) -> tuple[dict[str, Any], dict[KeyPath, str]]:
+def _read_file(path: Path) -> tuple[dict[str, Any], dict[KeyPath, str], dict[KeyPath, str]]:
     try:
         text = path.read_text(encoding="utf-8")
         table = tomllib.loads(text)
@@ -123,16 +126,22 @@ def _read_file(path: Path) -> tuple[dict[str, Any], dict[KeyPath, str]]:
         raise WrongUsage(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
     except tomllib.TOMLDecodeError as error:
         raise WrongUsage(f"{path}: is not valid TOML: {error}") from error
-    return table, {keys: f"{path}:{line}" for keys, line in lines_of_keys(text).items()}
+    keys, tables = lines_of_keys(text)
+    return (
+        table,
+        {key: f"{path}:{line}" for key, line in keys.items()},
+        {key: f"{path}:{line}" for key, line in tables.items()},
+    )
 
 
-def lines_of_keys(text: str) -> dict[KeyPath, int]:
-    """The line (from 1) on which each key of a valid TOML text is set, for tables the line of their header.
+def lines_of_keys(text: str) -> tuple[dict[KeyPath, int], dict[KeyPath, int]]:
+    """The lines (from 1) on which the keys of a valid TOML text are set, and those of the tables' headers.
 
     The standard parser tells no positions, so statements are cut off one by one: a header is one line, and a
     `key = value` ends where the lines so far parse.
     """
     found: dict[KeyPath, int] = {}
+    tables: dict[KeyPath, int] = {}
     table: KeyPath = ()
     lines = text.splitlines()
     index = 0
@@ -149,11 +158,11 @@ def lines_of_keys(text: str) -> dict[KeyPath, int]:
             continue
         if re.match(r"\s*\[", statement):
             table = _only_path(parsed)
-            found.setdefault(table, start + 1)
+            tables.setdefault(table, start + 1)
         else:
             for keys in _leaf_paths(parsed):
                 found[table + keys] = start + 1
-    return found
+    return found, tables
 
 
 def _try_parse(text: str) -> dict[str, Any] | None:
@@ -185,13 +194,13 @@ def _leaf_paths(table: Mapping[str, Any], before: KeyPath = ()) -> list[KeyPath]
     return paths
 
 
-def _single(keys: KeyPath, text: str, origin: str) -> tuple[dict[str, Any], dict[KeyPath, str]]:
+def _single(keys: KeyPath, text: str, origin: str) -> tuple[dict[str, Any], dict[KeyPath, str], dict[KeyPath, str]]:
     """One value from outside a file; text that is not a TOML value is taken as a string."""
     parsed = _try_parse(f"value = {text}")
     value: Any = text if parsed is None else parsed["value"]
     for key in reversed(keys):
         value = {key: value}
-    return value, {keys: origin}
+    return value, {keys: origin}, {}
 
 
 def _merge_into(target: dict[str, Any], extra: Mapping[str, Any]) -> None:

@@ -1,0 +1,56 @@
+"""The two clocks, handed out so that nobody else has to ask: monotonic for logic, wall time for labels."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Who is asked for the time, at the edges only."""
+
+    def now_ns(self) -> int:
+        """Monotonic nanoseconds: never steps, means nothing outside this machine's uptime."""
+
+    def wall_from_monotonic_ns(self, stamp_ns: int) -> int:
+        """The wall time (nanoseconds since 1970, UTC) of a monotonic stamp, by the wall clock as it stands now."""
+
+
+class SystemClock:
+    """The machine's clocks."""
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
+
+    def wall_from_monotonic_ns(self, stamp_ns: int) -> int:
+        """Follows steps of the wall clock at once: a label tells when something was by today's reckoning."""
+        return stamp_ns + wall_offset_ns()
+
+
+def wall_offset_ns() -> int:
+    """Wall clock less monotonic clock; the wall clock is read between two readings of the other one."""
+    before = time.monotonic_ns()
+    wall = time.time_ns()
+    return wall - (before + time.monotonic_ns()) // 2
+
+
+@dataclass(slots=True)
+class CrankedClock:
+    """A clock that moves when it is turned; for tests and for replay."""
+
+    monotonic_ns: int = 0
+    wall_offset_ns: int = 0
+
+    def now_ns(self) -> int:
+        return self.monotonic_ns
+
+    def wall_from_monotonic_ns(self, stamp_ns: int) -> int:
+        return stamp_ns + self.wall_offset_ns
+
+    def turn(self, nanoseconds: int) -> int:
+        """Let time pass; returns the new time. ValueError if it would run backwards."""
+        if nanoseconds < 0:
+            raise ValueError("monotonic time does not run backwards")
+        self.monotonic_ns += nanoseconds
+        return self.monotonic_ns
