@@ -25,7 +25,6 @@ What this emulator does that a naive one would not:
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -34,10 +33,10 @@ from numpy.typing import NDArray
 
 from sim_devices.checksums import scip_sum, scip_sums
 from sim_devices.device import F64, Mount, Scene
+from sim_devices.wire import SECOND_NS, PacedWire
 
 I64 = NDArray[np.int64]
 
-SECOND_NS = 1_000_000_000
 CLOCK_MASK = 0xFFFFFF
 MAX_FREE_STRING = 16
 MAX_COMMAND = 256
@@ -253,14 +252,6 @@ class _Stream:
     next_turn: int
 
 
-@dataclass(slots=True)
-class _Outgoing:
-    ready_ns: int
-    data: bytes
-    sent: int = 0
-    rate_after_bps: int | None = None  # SS: the line's rate once this has left
-
-
 class HokuyoLaser:
     """One laser rangefinder on its line. See the module's text for its habits.
 
@@ -340,12 +331,12 @@ class HokuyoLaser:
             self.power_on(now_ns)
         if now_ns < self._boot_done_ns:
             return b""
-        fits = self.link != "rs232" or baud is None or baud == self._rate_bps
+        fits = self.link != "rs232" or baud is None or baud == self._wire.rate_bps
         self._finish_sweeps(now_ns)
         if fits and received:
             self._take(received, now_ns)
             self._finish_sweeps(now_ns)
-        out = self._leave_by(now_ns)
+        out = self._wire.leave_by(now_ns)
         return out if fits else self._garbled(out)
 
     @property
@@ -356,10 +347,8 @@ class HokuyoLaser:
         due = [] if self._stream is None else [self._turn_done_ns(self._stream.next_turn)]
         if self._held is not None:
             due.append(self._turn_done_ns(self._first_turn))
-        if self._outgoing:
-            first = self._outgoing[0]
-            start_ns = max(first.ready_ns, self._wire_free_ns)
-            due.append(min(start_ns + self._wire_ns(len(first.data) - first.sent), start_ns + 1_000_000))
+        if (leaving_ns := self._wire.next_ns) is not None:
+            due.append(leaving_ns)
         return min(due, default=None)
 
     @property
@@ -370,7 +359,7 @@ class HokuyoLaser:
     @property
     def line_rate_bps(self) -> int:
         """The rate the line runs at now; on USB and TCP only a pace."""
-        return self._rate_bps
+        return self._wire.rate_bps
 
     def clock_ms(self, now_ns: int) -> int:
         """The device's own clock, 24 bits."""
@@ -387,11 +376,8 @@ class HokuyoLaser:
         self._slower_percent = 0
         self._period_ns = self.profile.period_ns
         self._turn_zero_ns = self._boot_done_ns + self._spin_up_ns
-        self._rate_bps = self._base_rate_bps
+        self._wire = PacedWire(self._base_rate_bps, now_ns)
         self._buffer = bytearray()
-        self._outgoing: deque[_Outgoing] = deque()
-        self._wire_free_ns = now_ns
-        self._wire_promised_ns = now_ns  # when all that is queued will have left
         self._stream: _Stream | None = None
         self._held: tuple[_Wanted, bytes] | None = None
         self._laser_on_ns: int | None = None
@@ -405,8 +391,7 @@ class HokuyoLaser:
         """The host's TCP connection ended: stop measuring and forget what was to be sent."""
         if self.link == "tcp":
             self._stop()
-            self._outgoing.clear()
-            self._wire_promised_ns = now_ns
+            self._wire.clear(now_ns)
             self._buffer.clear()
 
     def trouble(self, status: str | None, now_ns: int) -> None:
@@ -414,34 +399,10 @@ class HokuyoLaser:
         self._trouble = status
         if status is not None and self._stream is not None:
             wanted = self._stream.wanted
-            self._say(wanted.echo + b"00" + wanted.free + b"\n" + sealed(status.encode("ascii")) + b"\n", now_ns)
+            self._wire.send(wanted.echo + b"00" + wanted.free + b"\n" + sealed(status.encode("ascii")) + b"\n", now_ns)
             self._stop()
 
-    # -- the wire -----------------------------------------------------------------------------------------------------
-
-    def _wire_ns(self, count: int) -> int:
-        return count * 10 * SECOND_NS // self._rate_bps
-
-    def _say(self, data: bytes, now_ns: int, rate_after_bps: int | None = None) -> None:
-        self._outgoing.append(_Outgoing(now_ns, data, rate_after_bps=rate_after_bps))
-        self._wire_promised_ns = max(self._wire_promised_ns, now_ns) + self._wire_ns(len(data))
-
-    def _leave_by(self, now_ns: int) -> bytes:
-        out = bytearray()
-        while self._outgoing:
-            first = self._outgoing[0]
-            start_ns = max(first.ready_ns, self._wire_free_ns)
-            count = min(len(first.data) - first.sent, max(0, now_ns - start_ns) * self._rate_bps // (10 * SECOND_NS))
-            out += first.data[first.sent : first.sent + count]
-            first.sent += count
-            if count:
-                self._wire_free_ns = start_ns + self._wire_ns(count)
-            if first.sent < len(first.data):
-                break
-            self._outgoing.popleft()
-            if first.rate_after_bps is not None:
-                self._rate_bps = first.rate_after_bps
-        return bytes(out)
+    # -- the line -----------------------------------------------------------------------------------------------------
 
     def _garbled(self, sent: bytes) -> bytes:
         """What a host at another rate makes of these bytes."""
@@ -463,7 +424,7 @@ class HokuyoLaser:
         if self._scip1:
             self._obey_scip1(line, now_ns)
             return
-        hasty = self.refuse_hasty and line == self._last_command and bool(self._outgoing)
+        hasty = self.refuse_hasty and line == self._last_command and not self._wire.is_empty
         self._last_command = line
         command, semicolon, free = line.partition(b";")
         symbol = b"%ST" if line.startswith(b"%ST") else command[:2]
@@ -484,16 +445,18 @@ class HokuyoLaser:
     def _obey_scip1(self, line: bytes, now_ns: int) -> None:
         if line == b"SCIP2.0":
             self._scip1 = False
-            self._say(line + b"\n0\n\n", now_ns)
+            self._wire.send(line + b"\n0\n\n", now_ns)
         elif line == b"V":
             told = (("VEND", self.profile.vendor), ("PROD", self.profile.product), ("FIRM", self.profile.firmware),
                     ("PROT", "00003,(SCIP 1.0)"), ("SERI", self._serial))  # fmt: skip
-            self._say(b"V\n0\n" + "".join(f"{key}:{value}\n" for key, value in told).encode("ascii") + b"\n", now_ns)
+            self._wire.send(
+                b"V\n0\n" + "".join(f"{key}:{value}\n" for key, value in told).encode("ascii") + b"\n", now_ns
+            )
         else:
-            self._say(line + b"\nE\n\n", now_ns)
+            self._wire.send(line + b"\nE\n\n", now_ns)
 
     def _answer(self, echo: bytes, status: str, now_ns: int, lines: bytes = b"") -> None:
-        self._say(echo + b"\n" + sealed(status.encode("ascii")) + lines + b"\n", now_ns)
+        self._wire.send(echo + b"\n" + sealed(status.encode("ascii")) + lines + b"\n", now_ns)
 
     def _sized(self, command: bytes, free: bytes, length: int, now_ns: int) -> bool:
         """Whether a command is as long as it must be; refuses it otherwise."""
@@ -526,7 +489,7 @@ class HokuyoLaser:
         if self._slower_percent:
             speed = f"{self._slower_percent}%Down({rpm}[rpm])"
         rate = {"usb": "USB only", "tcp": "Ethernet 100 [Mbps]"}.get(
-            self.link, f"{self._rate_bps}[bps]<-Default setting by user"
+            self.link, f"{self._wire.rate_bps}[bps]<-Default setting by user"
         )
         measuring = (
             "IDLE" if self._stream is None else "Measuring by Sensitive Mode" if self._sensitive else "Measuring"
@@ -571,7 +534,7 @@ class HokuyoLaser:
         self._clock_zero_ns = now_ns
         self._clock_offset_ms = 0
         back_bps = self._base_rate_bps if self.link == "rs232" else None
-        self._say(command + free + b"\n" + sealed(b"00") + b"\n", now_ns, back_bps)
+        self._wire.send(command + free + b"\n" + sealed(b"00") + b"\n", now_ns, back_bps)
 
     def _time(self, command: bytes, free: bytes, now_ns: int) -> None:
         echo = command + free
@@ -610,10 +573,10 @@ class HokuyoLaser:
             self._answer(echo, "02", now_ns)
         elif self.link == "usb":
             self._answer(echo, "00", now_ns)
-        elif rate_bps == self._rate_bps:
+        elif rate_bps == self._wire.rate_bps:
             self._answer(echo, "03", now_ns)
         else:
-            self._say(echo + b"\n" + sealed(b"00") + b"\n", now_ns, rate_bps)
+            self._wire.send(echo + b"\n" + sealed(b"00") + b"\n", now_ns, rate_bps)
 
     def _motor_speed(self, command: bytes, free: bytes, now_ns: int) -> None:
         echo = command + free
@@ -655,7 +618,7 @@ class HokuyoLaser:
         reply = command + free + b"\n" + sealed(b"00") + b"\n"
         self.power_on(now_ns, boot_s=0.5)
         self._boot_done_ns = now_ns  # the reply still leaves; the motor needs its time again
-        self._say(reply, now_ns)
+        self._wire.send(reply, now_ns)
 
     def _simulate_fault(self, command: bytes, free: bytes, now_ns: int) -> None:
         if not self._sized(command, free, 4, now_ns):
@@ -757,7 +720,7 @@ class HokuyoLaser:
             self._report_latest(wanted, echo, self._turn_done_ns(self._first_turn))
         while self._stream is not None and self._turn_done_ns(self._stream.next_turn) <= now_ns:
             stream, done_ns = self._stream, self._turn_done_ns(self._stream.next_turn)
-            if self._wire_promised_ns > done_ns:
+            if self._wire.busy_at(done_ns):
                 self.skipped_scans += 1
                 stream.next_turn += 1
                 continue
