@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.frames import Pose2
+from mapping.frames import IDENTITY, Pose2
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot
@@ -80,11 +80,19 @@ class PoseOut:
 
 @dataclass(frozen=True, slots=True)
 class GridOut:
-    """Key map/grid: the whole map-fixed grid. epoch: counts full grids; updates name the epoch they belong to."""
+    """Key map/<name>: a whole grid. epoch: counts full grids; updates name the epoch they belong to.
+
+    name: `grid` is the map-fixed grid of the building, the only one with updates; `local` (rolling around the robot)
+    and `artos` (the two-step map) are small, sent whole, and have no ROS twin.  frame: in which cell (0, 0) begins at
+    frame_from_grid: `map` with the identity for `grid`.
+    """
 
     stamp_ns: int
     epoch: int
     patch: GridPatch
+    name: str = "grid"
+    frame: str = "map"
+    frame_from_grid: Pose2 = IDENTITY
 
 
 @dataclass(frozen=True, slots=True)
