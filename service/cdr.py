@@ -214,11 +214,6 @@ def encode_range(one: RangeOne) -> bytes:
     return w.message()
 
 
-def encode_range_humble(one: RangeOne) -> bytes:
-    """The bytes of a Range before Iron, which has no variance: the last four bytes less."""
-    return encode_range(one)[:-4]
-
-
 def encode_grid(grid: Grid) -> bytes:
     """The bytes of an OccupancyGrid; map_load_time is the stamp."""
     w = _Writer()

@@ -1,0 +1,309 @@
+"""Sends outputs over Zenoh: newest wins, nothing blocks, every loss is counted; answers plain get() and calls.
+
+fusion --offer--> outbox --> stream thread --> publishers            (scans, sectors, poses, health)
+              \\-> outbox --> map thread   --> publishers            (grids: slow, so they delay nothing else)
+                             last values --> answer thread --> get()
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from mapping.grids.patch import GridPatch
+from service import export, topics, zenoh_session
+from service.outputs import GridOut, GridUpdateOut, HealthOut, OdomOut, Output, PolarOut, PoseOut, RectOut, ScanOut
+from service.payloads import Encoder, Message, RobotInfo
+from service.ros import RosMirror, RosSettings
+from service.rpc import Calls
+from service.topics import Lane
+from service.zenoh_session import NetworkSettings
+
+_LOG = logging.getLogger(__name__)
+_UPDATES_WAITING_MAX = 64
+_QUERIES_WAITING_MAX = 64
+
+Parcel = Callable[[], list[Message]]
+
+
+class Outbox:
+    """What waits to be sent by one thread: one parcel a slot, the newest; or a short queue where order matters.
+
+    Thread-safe. dropped counts parcels by slot that were replaced, fell out of a full queue or were superseded.
+    """
+
+    def __init__(self) -> None:
+        self._slots: OrderedDict[str, deque[Parcel]] = OrderedDict()
+        self._changed = threading.Condition()
+        self._closed = False
+        self.dropped: Counter[str] = Counter()
+
+    def put(self, slot: str, parcel: Parcel, *, depth: int = 1, supersedes: str | None = None) -> None:
+        """Add a parcel; beyond depth the slot's oldest is lost. supersedes: a slot that this parcel empties."""
+        with self._changed:
+            if supersedes is not None and (old := self._slots.pop(supersedes, None)):
+                self.dropped[supersedes] += len(old)
+            waiting = self._slots.setdefault(slot, deque())
+            waiting.append(parcel)
+            if len(waiting) > depth:
+                waiting.popleft()
+                self.dropped[slot] += 1
+            self._changed.notify()
+
+    def take(self) -> Parcel | None:
+        """The parcel that waited longest, waiting for one; None when closed and empty."""
+        with self._changed:
+            while not self._slots:
+                if self._closed:
+                    return None
+                self._changed.wait()
+            slot, waiting = next(iter(self._slots.items()))
+            parcel = waiting.popleft()
+            if not waiting:
+                del self._slots[slot]
+            else:
+                self._slots.move_to_end(slot)
+            return parcel
+
+    def close(self) -> None:
+        """What waits is still taken; then take() gives None."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """The last value of a key. patch: the grid behind it, for other formats."""
+
+    message: Message
+    patch: GridPatch | None = None
+
+
+class Publisher:
+    """The daemon's Zenoh side. Construct, register calls, start(), offer() outputs, close()."""
+
+    def __init__(
+        self,
+        base: str,
+        network: NetworkSettings,
+        *,
+        wall_offset_ns: Callable[[], int],
+        monotonic_ns: Callable[[], int],
+        encoder: Encoder | None = None,
+        ros: RosSettings | None = None,
+    ) -> None:
+        """wall_offset_ns: wall clock minus monotonic clock now.  ros: also speak rmw_zenoh if given."""
+        self.base = topics.check_base(base)
+        self.calls = Calls(base)
+        self._network = network
+        self._wall_offset_ns = wall_offset_ns
+        self._monotonic_ns = monotonic_ns
+        self._encoder = encoder or Encoder()
+        self._ros_settings = ros
+        self._ros: RosMirror | None = None
+        self._session: Any = None
+        self._token: Any = None
+        self._outboxes = {lane: Outbox() for lane in Lane}
+        self._publishers: dict[str, Any] = {}
+        self._last: dict[str, _Kept] = {}
+        self._queries: queue.Queue[Any] = queue.Queue(_QUERIES_WAITING_MAX)
+        self._threads: list[threading.Thread] = []
+        self._taps: list[Callable[[Message], None]] = []
+        self._counts: Counter[str] = Counter()
+        self._complained: set[str] = set()
+
+    def add_tap(self, tap: Callable[[Message], None]) -> None:
+        """Every message is also handed to tap, from the sending threads: a recording, for instance. Before start()."""
+        self._taps.append(tap)
+
+    def start(self) -> None:
+        """Open the router and begin. PortInUse or NetworkTrouble if that cannot be."""
+        self._session = zenoh_session.open_router(self._network)
+        if self._ros_settings is not None:
+            self._ros = RosMirror(self._session, self._ros_settings)
+        zenoh_session.declare_queryable(self._session, f"{self.base}/**", self._on_query)
+        self.calls.start(self._session)
+        for lane in Lane:
+            self._spawn(f"publish-{lane.value}", self._send_loop, self._outboxes[lane])
+        self._spawn("publish-answers", self._answer_loop)
+        self._token = self._session.liveliness().declare_token(f"{self.base}/{topics.ALIVE}")
+
+    def _spawn(self, name: str, target: Callable[..., None], *arguments: object) -> None:
+        thread = threading.Thread(target=target, args=arguments, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def offer(self, output: Output) -> None:
+        """Send this soon, or something newer of its kind. Never waits; any thread.
+
+        Full grids are to be offered at most once a second, each before the updates of its epoch.
+        """
+        slot = slot_of(output)
+
+        def parcel() -> list[Message]:
+            return self._encode(output)
+
+        match output:
+            case GridOut():
+                self._outboxes[Lane.MAP].put(slot, parcel, supersedes=topics.MAP_GRID_UPDATE.pattern)
+            case GridUpdateOut():
+                self._outboxes[Lane.MAP].put(slot, parcel, depth=_UPDATES_WAITING_MAX)
+            case _:
+                self._outboxes[Lane.STREAM].put(slot, parcel)
+
+    def publish_info(self, info: RobotInfo) -> None:
+        """Send `info` and the fixed transforms; again whenever they change."""
+        self._outboxes[Lane.STREAM].put("info", lambda: self._encoder.info(info))
+
+    def counters(self) -> dict[str, int]:
+        """Everything sent, lost and refused so far, by name."""
+        counts = dict(self._counts)
+        for outbox in self._outboxes.values():
+            counts |= {f"not_sent.{slot}": count for slot, count in outbox.dropped.copy().items()}
+        counts["calls_answered"] = self.calls.answered
+        counts["calls_failed"] = self.calls.failed
+        counts["calls_refused"] = self.calls.refused
+        counts["grid_update_cells_outside"] = self._encoder.cells_outside
+        return counts
+
+    def close(self, deadline_s: float = 3.0) -> bool:
+        """Send what waits, close the session; False if the deadline passed (end the process with os._exit then)."""
+        end_ns = self._monotonic_ns() + int(deadline_s * 1e9)
+
+        def left_s() -> float:
+            return max(0.05, (end_ns - self._monotonic_ns()) / 1e9)
+
+        for outbox in self._outboxes.values():
+            outbox.close()
+        self._stop_answers()
+        self.calls.stop(left_s() / 2)
+        for thread in self._threads:
+            thread.join(left_s())
+        closed = self._session is None or zenoh_session.close_within(self._session, left_s())
+        self._session = None
+        return closed and not any(thread.is_alive() for thread in self._threads)
+
+    def _encode(self, output: Output) -> list[Message]:
+        messages = self._encoder.encode(output, self._wall_offset_ns())
+        if isinstance(output, GridOut):
+            self._last[messages[0].suffix] = _Kept(messages[0], output.patch)
+        return messages
+
+    def _send_loop(self, outbox: Outbox) -> None:
+        while (parcel := outbox.take()) is not None:
+            try:
+                for message in parcel():
+                    self._send(message)
+            except Exception as error:  # one bad value must not silence the robot; it is counted and told once
+                self._counts["not_sent_errors"] += 1
+                self._complain(error)
+
+    def _complain(self, error: Exception) -> None:
+        kind = f"{type(error).__name__}: {error}"[:200]
+        if kind not in self._complained and len(self._complained) < 100:
+            self._complained.add(kind)
+            _LOG.error("a value could not be published: %s", kind, exc_info=error)
+
+    def _send(self, message: Message) -> None:
+        kept = self._last.get(message.suffix)
+        if kept is None or kept.message is not message:
+            self._last[message.suffix] = _Kept(message)
+        self._publisher_of(message).put(message.payload, encoding=message.encoding, attachment=message.attachment)
+        self._counts["sent"] += 1
+        if self._ros is not None:
+            self._ros.publish(message)
+        for tap in self._taps:
+            tap(message)
+
+    def _publisher_of(self, message: Message) -> Any:
+        publisher = self._publishers.get(message.suffix)
+        if publisher is None:
+            topic, key = message.topic, f"{self.base}/{message.suffix}"
+            if topic.cached:
+                publisher = zenoh_session.declare_latched(self._session, key, topic.priority)
+            else:
+                publisher = zenoh_session.declare_stream(self._session, key, topic.priority, express=topic.express)
+            self._publishers[message.suffix] = publisher
+        return publisher
+
+    def _on_query(self, query: Any) -> None:
+        try:
+            self._queries.put_nowait(query)
+        except queue.Full:
+            self._counts["queries_refused"] += 1
+            with query:
+                query.reply_err(b"busy: too many queries are waiting; try again", encoding="text/plain")
+
+    def _stop_answers(self) -> None:
+        try:
+            self._queries.put_nowait(None)
+        except queue.Full:
+            self._queries.get_nowait()
+            self._queries.put_nowait(None)
+
+    def _answer_loop(self) -> None:
+        while (query := self._queries.get()) is not None:
+            with query:
+                try:
+                    self._answer(query)
+                    self._counts["queries_answered"] += 1
+                except Exception as error:
+                    self._counts["queries_failed"] += 1
+                    self._complain(error)
+
+    def _answer(self, query: Any) -> None:
+        wanted = query.key_expr
+        picture = query.parameters.get("format")
+        youngest_ns = self._youngest_allowed(query.parameters.get("max_age"))
+        for suffix, kept in list(self._last.items()):
+            key = f"{self.base}/{suffix}"
+            if not wanted.intersects(key) or kept.message.stamp_ns < youngest_ns:
+                continue
+            if picture is None or kept.patch is None:
+                message = kept.message
+                query.reply(key, message.payload, encoding=message.encoding, attachment=message.attachment)
+            elif picture in export.GRID_FORMATS:
+                payload, encoding = export.render_grid(kept.patch, picture, kept.message.stamp_ns)
+                query.reply(key, payload, encoding=encoding, attachment=kept.message.attachment)
+            else:
+                text = f"format={picture}: there are {', '.join(export.GRID_FORMATS)}"
+                query.reply_err(text.encode(), encoding="text/plain")
+
+    def _youngest_allowed(self, max_age: str | None) -> int:
+        """The oldest stamp to answer with, from `max_age` in seconds."""
+        try:
+            seconds = float(max_age) if max_age else None
+        except ValueError:
+            seconds = None
+        if seconds is None or seconds < 0:
+            return -(1 << 62)
+        return self._monotonic_ns() + self._wall_offset_ns() - int(min(seconds, 1e9) * 1e9)
+
+
+def slot_of(output: Output) -> str:
+    """Outputs with the same slot replace each other while they wait."""
+    match output:
+        case ScanOut():
+            return f"scan/{output.sensor}"
+        case PolarOut():
+            return f"sectors/polar/{output.name}"
+        case RectOut():
+            return f"sectors/rect/{output.name}"
+        case OdomOut():
+            return "odom"
+        case PoseOut():
+            return "pose"
+        case GridOut():
+            return topics.MAP_GRID.pattern
+        case GridUpdateOut():
+            return topics.MAP_GRID_UPDATE.pattern
+        case HealthOut():
+            return "health"
+        case _:
+            return f"range/{output.sensor}"
