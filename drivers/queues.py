@@ -1,0 +1,91 @@
+"""A queue with a bound, a policy when it is full, and a counter: between the reader threads and the fusion thread.
+
+Putting never blocks: a slow consumer must not stop a wire. When full, the oldest reading of the source that fills the
+queue most is thrown away, so that a flood from one device does not cost the others theirs. Events about devices
+(absent, silent) are kept as long as any reading can go instead: a lost "silent" would leave old sectors looking fresh.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from drivers.readings import DeviceEvent
+
+ItemT = TypeVar("ItemT")
+
+
+class BoundedQueue(Generic[ItemT]):
+    """Items of named sources, first in first out, never more than `limit` of them.
+
+    keep: tells what must not be thrown away while anything else can; by default the DeviceEvents.
+    """
+
+    def __init__(self, limit: int, *, keep: Callable[[ItemT], bool] | None = None) -> None:
+        if limit < 1:
+            raise ValueError(f"a queue needs room for at least one item, not {limit}")
+        self._limit = limit
+        self._keep = keep if keep is not None else _is_event
+        self._items: deque[tuple[str, ItemT]] = deque()
+        self._droppable: dict[str, int] = {}
+        self._dropped: dict[str, int] = {}
+        self._changed = threading.Condition()
+
+    def put(self, source: str, item: ItemT) -> None:
+        """Add an item; never blocks. May be given to a reader as its sink."""
+        with self._changed:
+            if len(self._items) >= self._limit:
+                self._drop_one()
+            self._items.append((source, item))
+            if not self._keep(item):
+                self._droppable[source] = self._droppable.get(source, 0) + 1
+            self._changed.notify()
+
+    def get(self, timeout_s: float | None = None) -> tuple[str, ItemT] | None:
+        """The oldest item with its source; None if nothing comes within timeout_s (None: wait for ever)."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: bool(self._items), timeout_s):
+                return None
+            return self._take_first()
+
+    def get_all(self, timeout_s: float | None = None) -> list[tuple[str, ItemT]]:
+        """Everything that waits, oldest first; an empty list if nothing comes within timeout_s."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._items), timeout_s)
+            items = list(self._items)
+            self._items.clear()
+            self._droppable.clear()
+            return items
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def dropped(self) -> dict[str, int]:
+        """How many items were thrown away because the queue was full, by source."""
+        with self._changed:
+            return dict(self._dropped)
+
+    def _take_first(self) -> tuple[str, ItemT]:
+        source, item = self._items.popleft()
+        if not self._keep(item):
+            self._droppable[source] -= 1
+        return source, item
+
+    def _drop_one(self) -> None:
+        victim = max(self._droppable, key=self._droppable.__getitem__, default=None)
+        if victim is None or self._droppable[victim] == 0:
+            source, _ = self._items.popleft()  # nothing but events: the oldest of them is the least true
+            self._dropped[source] = self._dropped.get(source, 0) + 1
+            return
+        for index, (source, item) in enumerate(self._items):
+            if source == victim and not self._keep(item):
+                del self._items[index]
+                break
+        self._droppable[victim] -= 1
+        self._dropped[victim] = self._dropped.get(victim, 0) + 1
+
+
+def _is_event(item: object) -> bool:
+    return isinstance(item, DeviceEvent)

@@ -1,0 +1,548 @@
+"""The loop that joins wires and conversations: opens, reads, asks, notices silence, comes back, counts.
+
+One thread per wire; several conversations may share a CAN wire, each then sees every frame. The loop never gives up:
+
+    port cannot be opened or is lost   ABSENT at once; tried again after 0.1 s, later up to 1 s, for ever
+    no reading within silence_limit    SILENT; the conversation starts from reset, again after 0.1 s to 1 s if need be
+    set-up takes for ever              the conversation starts from reset after 10 s
+    an exception in a conversation     a bug: logged with its traceback, counted, that conversation alone restarts
+
+`step` does one turn of the loop and may be called without a thread: tests own clock and port.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Generic
+
+from drivers.conversation import Conversation, SetBaudRate, WireT
+from drivers.errors import PortError
+from drivers.ports import Clock, Direction, Port, Tap
+from drivers.readings import ClockFit, DeviceEvent, Identity, LinkState, Reading, SourceCounters
+
+log = logging.getLogger(__name__)
+
+Sink = Callable[[str, Reading | DeviceEvent], None]
+"""Where readings and events go: (source, item). Must not block; BoundedQueue.put is one."""
+
+POLL_PERIOD_NS = 20_000_000  # requests() is called at least so often
+_FIRST_BACKOFF_NS = 100_000_000
+_LONGEST_BACKOFF_NS = 1_000_000_000
+_SETUP_LIMIT_NS = 10_000_000_000
+_EVENT_PERIOD_NS = 1_000_000_000  # between two events that tell the same state in other words
+_LOG_PERIOD_NS = 60_000_000_000
+_SHORTEST_WAIT_S = 0.0005
+
+
+@dataclass(frozen=True, slots=True)
+class SourceHealth:
+    """One source at one instant, for the health report.
+
+    since_ns: when the state was entered.  trouble: in words, with the repair, or None.  rate_hz: readings a second.
+    age_ns: since the last reading, None if there was none.  restarts: conversations begun anew.  bugs: exceptions.
+    """
+
+    name: str
+    state: LinkState
+    since_ns: int
+    trouble: str | None
+    identity: Identity | None
+    rate_hz: float
+    age_ns: int | None
+    readings: int
+    restarts: int
+    bugs: int
+    counters: SourceCounters
+    clock_fit: ClockFit | None
+
+
+@dataclass(frozen=True, slots=True)
+class WireHealth:
+    """One wire at one instant. openings: how often it was opened.  drops: what the port threw away, by reason."""
+
+    name: str
+    is_open: bool
+    trouble: str | None
+    openings: int
+    drops: dict[str, int]
+    sources: dict[str, SourceHealth] = field(default_factory=dict)
+
+
+class WireReader(Generic[WireT]):
+    """Owns one wire and the conversations on it.
+
+    open_port: opens the wire, raising PortError when it cannot.  conversations: by source name.  clock: monotonic
+    nanoseconds.  tap: hears every item in and out, for the recording.  wait: sleeps between attempts to open (tests
+    hand in one that cranks their clock); by default a wait that stop() ends.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        open_port: Callable[[], Port[WireT]],
+        conversations: Mapping[str, Conversation[WireT]],
+        sink: Sink,
+        *,
+        clock: Clock,
+        tap: Tap | None = None,
+        wait: Callable[[float], object] | None = None,
+    ) -> None:
+        self.name = name
+        self._open_port: Callable[[], Port[WireT]] = open_port
+        self._clock = clock
+        self._tap = tap
+        self._stopping = threading.Event()
+        self._wait = wait if wait is not None else self._stopping.wait
+        self._lock = threading.RLock()  # held while a batch is worked on, never while waiting for one
+        self._port: Port[WireT] | None = None
+        self._port_trouble: str | None = "not opened yet"
+        self._past_drops: dict[str, int] = {}
+        self._openings = 0
+        self._backoff = _Backoff()
+        self._heard_ns = 0
+        self._thread: threading.Thread | None = None
+        self._log = _RateLimitedLog()
+        self._sources: list[_Source[WireT]] = [
+            _Source(source, conversation, sink, self._log, tap) for source, conversation in conversations.items()
+        ]
+
+    # ---- the thread
+
+    def start(self) -> None:
+        """Start the thread. A reader starts once."""
+        self._thread = threading.Thread(target=self.run, name=f"wire {self.name}", daemon=True)
+        self._thread.start()
+
+    def stop(self, deadline_s: float = 1.0) -> bool:
+        """Say farewell to the devices, close the wire, end the thread; False if that took longer than deadline_s."""
+        self._stopping.set()
+        if self._thread is None:
+            self.close()
+            return True
+        self._thread.join(deadline_s)
+        if self._thread.is_alive():
+            log.error("%s: did not close within %.1f s and is left behind", self.name, deadline_s)
+            return False
+        return True
+
+    def run(self) -> None:
+        """The loop, until stop(). Called by the thread."""
+        while not self._stopping.is_set():
+            try:
+                self.step()
+            except Exception:  # a bug here or in the port: this wire starts again, the others never notice
+                self._log.exception(self._clock(), f"{self.name}: loop", "%s: internal error, reopening", self.name)
+                self._give_up("internal error (a bug: see the log)")
+        self.close()
+
+    def close(self) -> None:
+        """Leave the devices safe and close the wire. For use without a thread; stop() does it otherwise."""
+        with self._lock:
+            port, self._port = self._port, None
+        if port is None:
+            return
+        try:
+            for source in self._sources:
+                self._send(port, source.farewell(), self._clock())
+        except PortError as error:
+            log.warning("%s: could not say farewell: %s", self.name, error)
+        port.close()
+
+    # ---- one turn
+
+    def step(self) -> None:
+        """One turn: open if closed, else wait for input (20 ms at most), hand it on, send what is due."""
+        if self._port is None:
+            self._open_when_due()
+            return
+        port = self._port
+        try:
+            items = port.read(self._wait_s(self._clock()))
+            with self._lock:
+                self._hand_on(items)
+                now_ns = self._clock()
+                for source in self._sources:
+                    self._send(port, source.requests(now_ns), now_ns)
+                for source in self._sources:
+                    source.check(now_ns)
+        except PortError as error:
+            self._give_up(str(error))
+            return
+        self._reopen_if_dead_silent(port)
+
+    def health(self) -> WireHealth:
+        """A snapshot, from any thread."""
+        with self._lock:
+            now_ns = self._clock()
+            drops = dict(self._past_drops)
+            if self._port is not None:
+                _add(drops, self._port.drops)
+            return WireHealth(
+                name=self.name,
+                is_open=self._port is not None,
+                trouble=self._port_trouble,
+                openings=self._openings,
+                drops=drops,
+                sources={source.name: source.health(now_ns) for source in self._sources},
+            )
+
+    def _open_when_due(self) -> None:
+        wait_ns = self._backoff.due_ns - self._clock()
+        if wait_ns > 0:
+            self._wait(min(wait_ns, _LONGEST_BACKOFF_NS) / 1e9)
+            return
+        try:
+            port = self._open_port()
+        except PortError as error:
+            self._give_up(str(error))
+            return
+        with self._lock:
+            self._port = port
+            self._port_trouble = None
+            self._openings += 1
+            now_ns = self._clock()
+            self._heard_ns = now_ns
+            for source in self._sources:
+                source.opened(now_ns)
+
+    def _wait_s(self, now_ns: int) -> float:
+        due_ns = now_ns + POLL_PERIOD_NS
+        for source in self._sources:
+            due_ns = min(due_ns, source.next_request_ns(due_ns))
+        return max((due_ns - now_ns) / 1e9, _SHORTEST_WAIT_S)
+
+    def _hand_on(self, items: list[tuple[WireT, int]]) -> None:
+        for item, stamp_ns in items:
+            self._heard_ns = stamp_ns
+            if self._tap is not None:
+                self._tap(Direction.IN, stamp_ns, item)
+            for source in self._sources:
+                source.receive(item, stamp_ns)
+        if items:
+            self._backoff.reset()
+
+    def _send(self, port: Port[WireT], items: Iterable[WireT | SetBaudRate], now_ns: int) -> None:
+        for item in items:
+            if self._tap is not None:
+                self._tap(Direction.OUT, now_ns, item)
+            if isinstance(item, SetBaudRate):
+                port.set_baud(item.bits_per_s)
+            else:
+                port.write(item)
+
+    def _give_up(self, why: str) -> None:
+        """The wire is lost or cannot be opened: close it, tell everyone, come back after the back-off."""
+        with self._lock:
+            now_ns = self._clock()
+            port, self._port = self._port, None
+            self._port_trouble = why
+            self._backoff.next(now_ns)
+            if port is not None and self._tap is not None:
+                self._tap(Direction.LOST, now_ns, why)
+            for source in self._sources:
+                source.lost(now_ns, why)
+            if port is not None:
+                _add(self._past_drops, port.drops)
+        if port is not None:
+            port.close()
+
+    def _reopen_if_dead_silent(self, port: Port[WireT]) -> None:
+        """A wire on which nothing at all is heard may be half open: begin anew, quietly (all is SILENT already)."""
+        limit_s = port.silence_reopen_s
+        if limit_s is None or self._clock() - self._heard_ns < limit_s * 1e9:
+            return
+        with self._lock:
+            self._port = None
+            self._port_trouble = f"nothing heard for {limit_s:.0f} s, opening again"
+            self._backoff.due_ns = self._clock()
+            if self._tap is not None:
+                self._tap(Direction.LOST, self._clock(), self._port_trouble)
+            _add(self._past_drops, port.drops)
+        port.close()
+
+
+class _Source(Generic[WireT]):
+    """One conversation with what the loop keeps about it. Pure but for the sink and the log."""
+
+    def __init__(
+        self, name: str, conversation: Conversation[WireT], sink: Sink, rated_log: _RateLimitedLog, tap: Tap | None
+    ) -> None:
+        self.name = name
+        self._conversation: Conversation[WireT] = conversation
+        self._sink = sink
+        self._log = rated_log
+        self._tap = tap
+        self._next_request: Callable[[], int | None] | None = getattr(conversation, "next_request_ns", None)
+        self._wire_trouble: str | None = "not opened yet"
+        self._loop_trouble: str | None = None  # what the loop found wrong: silence, a bug
+        self._broken_until_ns: int | None = None  # after a bug: left alone until then
+        self._restart_backoff = _Backoff()
+        self._alive_ns = 0  # last reading, or when RUNNING was entered
+        self._setup_ns = 0  # when the conversation was last (re)started or moved on
+        self._seen_state: LinkState | None = None
+        self._told: tuple[LinkState, str, Identity | None] | None = None
+        self._told_ns = 0
+        self._since_ns = 0
+        self._readings = 0
+        self._restarts = 0
+        self._bugs = 0
+        self._last_reading_ns: int | None = None
+        self._rate = _Rate()
+
+    # ---- what the loop tells
+
+    def opened(self, now_ns: int) -> None:
+        self._wire_trouble = None
+        self._loop_trouble = None
+        self._broken_until_ns = None
+        self._restart(now_ns)
+        self._tell(now_ns)
+
+    def lost(self, now_ns: int, why: str) -> None:
+        self._wire_trouble = why
+        self._tell(now_ns)
+
+    def receive(self, item: WireT, stamp_ns: int) -> None:
+        if self._broken_until_ns is not None:
+            return
+        try:
+            for reading in self._conversation.receive(item, stamp_ns):
+                self._note_reading(stamp_ns)
+                self._sink(self.name, reading)
+        except Exception as error:
+            self._note_bug(stamp_ns, error)
+
+    def requests(self, now_ns: int) -> Iterable[WireT | SetBaudRate]:
+        if self._broken_until_ns is not None:
+            return ()
+        try:
+            items: Iterable[WireT | SetBaudRate] = self._conversation.requests(now_ns)
+        except Exception as error:
+            self._note_bug(now_ns, error)
+            return ()
+        return items
+
+    def farewell(self) -> Iterable[WireT | SetBaudRate]:
+        try:
+            items: Iterable[WireT | SetBaudRate] = self._conversation.farewell()
+        except Exception:
+            log.exception("%s: farewell failed", self.name)
+            return ()
+        return items
+
+    def next_request_ns(self, latest_ns: int) -> int:
+        """When requests() should be called next; a conversation that keeps a beat says so, others are polled."""
+        if self._next_request is None or self._broken_until_ns is not None:
+            return latest_ns
+        try:
+            due_ns = self._next_request()
+        except Exception:
+            return latest_ns  # requests() will meet the same trouble and report it
+        return latest_ns if due_ns is None else due_ns
+
+    def check(self, now_ns: int) -> None:
+        """Notice silence, set-up that does not end, and changes worth telling."""
+        if self._broken_until_ns is not None:
+            if now_ns >= self._broken_until_ns:
+                self._broken_until_ns = None
+                self._loop_trouble = None
+                self._restart(now_ns)
+            return
+        try:
+            self._supervise(now_ns)
+            self._tell(now_ns)
+        except Exception as error:
+            self._note_bug(now_ns, error)
+
+    def health(self, now_ns: int) -> SourceHealth:
+        conversation = self._conversation
+        state, text, identity = self._told if self._told is not None else (LinkState.ABSENT, "not opened yet", None)
+        counters = conversation.counters
+        return SourceHealth(
+            name=self.name,
+            state=state,
+            since_ns=self._since_ns,
+            trouble=self._trouble() if state is LinkState.RUNNING else text,
+            identity=identity,
+            rate_hz=self._rate.hz(now_ns),
+            age_ns=None if self._last_reading_ns is None else now_ns - self._last_reading_ns,
+            readings=self._readings,
+            restarts=self._restarts,
+            bugs=self._bugs,
+            counters=replace(counters, drops=dict(counters.drops)),
+            clock_fit=conversation.clock_fit,
+        )
+
+    # ---- how it works
+
+    def _supervise(self, now_ns: int) -> None:
+        state = self._conversation.state
+        if state is not self._seen_state:
+            self._seen_state = state
+            self._setup_ns = now_ns
+            if state in (LinkState.STARTING, LinkState.RUNNING):
+                self._loop_trouble = None  # it answers again
+            if state is LinkState.RUNNING:
+                self._alive_ns = max(self._alive_ns, now_ns)
+        limit_ns = self._conversation.silence_limit_ns
+        if state is LinkState.RUNNING:
+            silence_ns = now_ns - self._alive_ns
+            if silence_ns > limit_ns:
+                self._loop_trouble = f"no reading for {silence_ns / 1e9:.2f} s: check its power and cable"
+                self._restart_when_due(now_ns)
+            else:
+                self._loop_trouble = None
+        elif now_ns - self._setup_ns > _SETUP_LIMIT_NS:
+            self._restart(now_ns)
+
+    def _restart_when_due(self, now_ns: int) -> None:
+        """Silence: start anew, but no more often than the back-off allows: a device may come and go."""
+        if now_ns >= self._restart_backoff.due_ns:
+            self._restart_backoff.next(now_ns)
+            self._restart(now_ns)
+
+    def _restart(self, now_ns: int) -> None:
+        self._restarts += 1
+        self._setup_ns = now_ns
+        if self._tap is not None:
+            self._tap(Direction.CONNECTED, now_ns, self.name)
+        try:
+            self._conversation.connected(now_ns)
+        except Exception as error:
+            self._note_bug(now_ns, error)
+
+    def _note_reading(self, stamp_ns: int) -> None:
+        self._readings += 1
+        self._alive_ns = stamp_ns
+        self._last_reading_ns = stamp_ns
+        self._loop_trouble = None
+        self._restart_backoff.note_life(stamp_ns)
+        self._rate.count(stamp_ns)
+
+    def _note_bug(self, now_ns: int, error: Exception) -> None:
+        """Called while handling the exception. The conversation is left alone for a second, then restarted."""
+        self._bugs += 1
+        self._conversation.counters.drop("bug")
+        self._broken_until_ns = now_ns + _LONGEST_BACKOFF_NS
+        self._loop_trouble = f"internal error, {type(error).__name__}: {error} (a bug: please report it with the log)"
+        self._log.exception(now_ns, f"{self.name}: {type(error).__name__}", "%s: %s", self.name, self._loop_trouble)
+        self._tell(now_ns)
+
+    def _trouble(self) -> str | None:
+        if self._broken_until_ns is not None:
+            return self._loop_trouble
+        return self._conversation.trouble or self._loop_trouble
+
+    def _tell(self, now_ns: int) -> None:
+        """Queue an event if there is news: another state, another identity, or (once a second) other words."""
+        if self._wire_trouble is not None:
+            state, text = LinkState.ABSENT, self._wire_trouble
+        else:
+            state = LinkState.SILENT if self._loop_trouble is not None else self._conversation.state
+            text = self._trouble() or _words(state)
+        news = (state, text, self._conversation.identity)
+        if news == self._told:
+            return
+        told = self._told
+        if told is not None and told[0] is state and told[2] == news[2] and now_ns - self._told_ns < _EVENT_PERIOD_NS:
+            return
+        if told is None or told[0] is not state:
+            self._since_ns = now_ns
+        self._told, self._told_ns = news, now_ns
+        self._sink(self.name, DeviceEvent(now_ns, state, text, news[2]))
+        level = logging.INFO if state in (LinkState.STARTING, LinkState.RUNNING) else logging.WARNING
+        self._log.say(now_ns, f"{self.name}: {state.name}", level, f"{self.name}: {state.name.lower()}: {text}")
+
+
+_WORDS = {
+    LinkState.ABSENT: "its port is not there",
+    LinkState.SILENT: "no answer yet",
+    LinkState.STARTING: "answers, is being set up",
+    LinkState.RUNNING: "readings arrive",
+}
+
+
+def _words(state: LinkState) -> str:
+    return _WORDS[state]
+
+
+class _Backoff:
+    """When to try next: at once, then after 0.1 s, doubling to 1 s, for ever."""
+
+    def __init__(self) -> None:
+        self.due_ns = 0
+        self._wait_ns = _FIRST_BACKOFF_NS
+
+    def next(self, now_ns: int) -> None:
+        """An attempt was made (or the wire lost) now."""
+        self.due_ns = now_ns + self._wait_ns
+        self._wait_ns = min(2 * self._wait_ns, _LONGEST_BACKOFF_NS)
+
+    def reset(self) -> None:
+        """It worked: the next loss is a new one."""
+        self._wait_ns = _FIRST_BACKOFF_NS
+
+    def note_life(self, now_ns: int) -> None:
+        """Like reset, but only after it has worked for longer than the longest wait."""
+        if now_ns > self.due_ns + _LONGEST_BACKOFF_NS:
+            self.reset()
+
+
+class _Rate:
+    """Readings a second, over windows of about one second."""
+
+    def __init__(self) -> None:
+        self._window_ns: int | None = None
+        self._count = 0
+        self._hz = 0.0
+        self._last_ns = 0
+
+    def count(self, stamp_ns: int) -> None:
+        self._last_ns = stamp_ns
+        if self._window_ns is None:
+            self._window_ns, self._count = stamp_ns, 0
+            return
+        self._count += 1
+        elapsed_ns = stamp_ns - self._window_ns
+        if elapsed_ns >= 1_000_000_000:
+            self._hz = self._count * 1e9 / elapsed_ns
+            self._window_ns, self._count = stamp_ns, 0
+
+    def hz(self, now_ns: int) -> float:
+        if self._window_ns is None or now_ns - self._last_ns > 2_000_000_000:
+            return 0.0
+        if self._hz == 0.0 and self._last_ns > self._window_ns:  # within the first second
+            return self._count * 1e9 / (self._last_ns - self._window_ns)
+        return self._hz
+
+
+class _RateLimitedLog:
+    """One line per cause per minute; the next line of that cause tells how many were kept back."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[int, int]] = {}  # cause -> (when told, kept back since)
+
+    def say(self, now_ns: int, cause: str, level: int, text: str) -> None:
+        kept_back = self._due(now_ns, cause)
+        if kept_back is not None:
+            log.log(level, "%s%s", text, f" (and {kept_back} times more since last told)" if kept_back else "")
+
+    def exception(self, now_ns: int, cause: str, text: str, *args: object) -> None:
+        if self._due(now_ns, cause) is not None:
+            log.exception(text, *args)
+
+    def _due(self, now_ns: int, cause: str) -> int | None:
+        told_ns, kept_back = self._last.get(cause, (None, 0))
+        if told_ns is not None and now_ns - told_ns < _LOG_PERIOD_NS:
+            self._last[cause] = (told_ns, kept_back + 1)
+            return None
+        self._last[cause] = (now_ns, 0)
+        return kept_back
+
+
+def _add(total: dict[str, int], more: dict[str, int]) -> None:
+    for reason, count in more.items():
+        total[reason] = total.get(reason, 0) + count
