@@ -238,8 +238,10 @@ def interpret_pixels(
 ) -> I8:
     """Picture lines (uppermost first, brightness 0 to 1) as cells (row 0 lowest), as the map server does.
 
-    trinary: occupied, free or unknown by the thresholds.  scale: between the thresholds proportionally, transparent
-    pixels unknown.  raw: the pixel value itself, above 100 unknown.
+    trinary: occupied, free or unknown by the thresholds; grey 205 is unknown whatever free_thresh says, because common
+    map savers write unknown as 205 beside free_thresh 0.25, which would read it back as free.
+    scale: between the thresholds proportionally, transparent pixels unknown.
+    raw: the pixel value itself, above 100 unknown.
     """
     lines = pixels[::-1]
     if mode == "raw":
@@ -255,6 +257,8 @@ def interpret_pixels(
     else:
         raise MapFileTrouble(f"{where}: mode {mode!r}: there are trinary, scale, raw")
     cells = np.where(occupied > occupied_threshold, 100.0, np.where(occupied < free_threshold, 0.0, between))
+    if mode == "trinary" and not negate:
+        cells[np.rint(lines * 255.0) == _UNKNOWN_PIXEL] = -1.0
     cells[~opaque[::-1]] = -1.0
     return cells.astype(np.int8)
 
