@@ -7,6 +7,7 @@ fusion --offer--> outbox --> stream thread --> publishers            (scans, sec
 
 from __future__ import annotations
 
+import json
 import logging
 import queue
 import threading
@@ -17,6 +18,7 @@ from typing import Any
 
 from mapping.grids.patch import GridPatch
 from service import export, topics, zenoh_session
+from service.clock import Clock
 from service.outputs import GridOut, GridUpdateOut, HealthOut, OdomOut, Output, PolarOut, PoseOut, RectOut, ScanOut
 from service.payloads import Encoder, Message, RobotInfo
 from service.ros import RosMirror, RosSettings
@@ -93,17 +95,15 @@ class Publisher:
         base: str,
         network: NetworkSettings,
         *,
-        wall_offset_ns: Callable[[], int],
-        monotonic_ns: Callable[[], int],
+        clock: Clock,
         encoder: Encoder | None = None,
         ros: RosSettings | None = None,
     ) -> None:
-        """wall_offset_ns: wall clock minus monotonic clock now.  ros: also speak rmw_zenoh if given."""
+        """clock: monotonic stamps leave as wall time by it.  ros: also speak rmw_zenoh if given."""
         self.base = topics.check_base(base)
         self.calls = Calls(base)
         self._network = network
-        self._wall_offset_ns = wall_offset_ns
-        self._monotonic_ns = monotonic_ns
+        self._clock = clock
         self._encoder = encoder or Encoder()
         self._ros_settings = ros
         self._ros: RosMirror | None = None
@@ -174,10 +174,10 @@ class Publisher:
 
     def close(self, deadline_s: float = 3.0) -> bool:
         """Send what waits, close the session; False if the deadline passed (end the process with os._exit then)."""
-        end_ns = self._monotonic_ns() + int(deadline_s * 1e9)
+        end_ns = self._clock.now_ns() + int(deadline_s * 1e9)
 
         def left_s() -> float:
-            return max(0.05, (end_ns - self._monotonic_ns()) / 1e9)
+            return max(0.05, (end_ns - self._clock.now_ns()) / 1e9)
 
         for outbox in self._outboxes.values():
             outbox.close()
@@ -190,7 +190,7 @@ class Publisher:
         return closed and not any(thread.is_alive() for thread in self._threads)
 
     def _encode(self, output: Output) -> list[Message]:
-        messages = self._encoder.encode(output, self._wall_offset_ns())
+        messages = self._encoder.encode(output, self._clock.wall_from_monotonic_ns(0))
         if isinstance(output, GridOut):
             self._last[messages[0].suffix] = _Kept(messages[0], output.patch)
         return messages
@@ -270,7 +270,8 @@ class Publisher:
                 query.reply(key, message.payload, encoding=message.encoding, attachment=message.attachment)
             elif picture in export.GRID_FORMATS:
                 payload, encoding = export.render_grid(kept.patch, picture, kept.message.stamp_ns)
-                query.reply(key, payload, encoding=encoding, attachment=kept.message.attachment)
+                properties = json.dumps(export.grid_properties(kept.patch, kept.message.stamp_ns))
+                query.reply(key, payload, encoding=encoding, attachment=properties)
             else:
                 text = f"format={picture}: there are {', '.join(export.GRID_FORMATS)}"
                 query.reply_err(text.encode(), encoding="text/plain")
@@ -283,7 +284,7 @@ class Publisher:
             seconds = None
         if seconds is None or seconds < 0:
             return -(1 << 62)
-        return self._monotonic_ns() + self._wall_offset_ns() - int(min(seconds, 1e9) * 1e9)
+        return self._clock.wall_from_monotonic_ns(self._clock.now_ns()) - int(min(seconds, 1e9) * 1e9)
 
 
 def slot_of(output: Output) -> str:

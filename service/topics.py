@@ -262,3 +262,24 @@ def check_base(base: str) -> str:
             f"key base {base!r}: chunks of lower-case letters, digits, _ and - joined by /, such as robots/artos"
         )
     return base
+
+
+def markdown_table() -> str:
+    """The table for docs/keys.md."""
+    lines = [
+        "| key below `robots/<id>/` | payload | encoding | rate | priority | cached | meaning |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for topic in TOPICS:
+        priority = topic.priority.value + (", express" if topic.express else "")
+        cached = "last value" if topic.cached else "no"
+        lines.append(
+            f"| `{topic.pattern}` | {topic.payload} | `{topic.encoding}` | {topic.rate} | {priority} | {cached}"
+            f" | {topic.meaning} |"
+        )
+    lines.append(f"| `{ALIVE}` | | | | | liveliness token | There while the daemon is; gone at once when it ends. |")
+    lines.append(
+        f"| `{RPC}/<name>` | JSON in, JSON out | `{JSON_REPLY}` | | | no"
+        " | Calls, by get() with a payload. `*` and `**` never match them. |"
+    )
+    return "\n".join(lines) + "\n"
