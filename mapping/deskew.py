@@ -1,0 +1,77 @@
+"""Take the vehicle's motion during a sweep out of a scan.
+
+A sweep lasts 25 to 200 ms; at 1 m/s and 1 rad/s its last beam is measured centimetres and degrees away from its first.
+Every beam has its time, so every beam has its own sensor pose; all are expressed in one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.frames import Pose2, wrap_angles
+from mapping.pose_buffer import PoseBuffer
+from mapping.scan import Scan
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Deskewed:
+    """A scan as if all of it had been measured at once, at scan.stamp_ns, from odom_from_sensor.
+
+    scan: bearings and ranges in the sensor frame of that instant; the order of beams is kept, +inf, -inf and NaN stay
+    what they are (a beam without echo is turned, not moved).  origin_m: (N, 2) where each beam really started, in that
+    frame.  spread_m: the largest distance of an origin from the frame's own.
+    """
+
+    scan: Scan
+    odom_from_sensor: Pose2
+    origin_m: F64
+    spread_m: float
+
+
+def beam_stamps(scan: Scan) -> NDArray[np.int64]:
+    """(N,) when each beam was measured."""
+    return scan.stamp_ns + np.rint(np.arange(len(scan.bearing_rad)) * scan.beam_period_ns).astype(np.int64)
+
+
+def deskew(scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> Deskewed:
+    """Express a scan in the sensor's frame at the time of its middle beam.
+
+    The middle halves the largest displacement of a beam's origin against first or last.
+    Raises NotYetError while odometry has not reached the last beam, GoneError when it does not reach back to the first.
+    Source: S28 with each beam's own pose; interpolation on SE(2), nothing extrapolated.
+    """
+    stamps = beam_stamps(scan)
+    reference_ns = int(stamps[len(stamps) // 2]) if len(stamps) else scan.stamp_ns
+    reference = odom_from_base.at(reference_ns) @ base_from_sensor
+    if not len(stamps) or scan.beam_period_ns == 0.0:
+        at_once = Scan(reference_ns, 0.0, scan.bearing_rad, scan.range_m, scan.range_min_m, scan.range_max_m)
+        return Deskewed(at_once, reference, np.zeros((len(stamps), 2)), 0.0)
+    origin, turn = _sensor_motion(odom_from_base.at_many(stamps), base_from_sensor, reference)
+    bearing = scan.bearing_rad + turn
+    hit = np.isfinite(scan.range_m)
+    reach = np.where(hit, scan.range_m, 0.0)
+    x, y = origin[:, 0] + reach * np.cos(bearing), origin[:, 1] + reach * np.sin(bearing)
+    moved = Scan(
+        reference_ns,
+        0.0,
+        np.where(hit, np.arctan2(y, x), wrap_angles(bearing)),
+        np.where(hit, np.hypot(x, y), scan.range_m),
+        scan.range_min_m,
+        scan.range_max_m,
+    )
+    return Deskewed(moved, reference, origin, float(np.hypot(origin[:, 0], origin[:, 1]).max()))
+
+
+def _sensor_motion(odom_from_base: F64, base_from_sensor: Pose2, odom_from_reference: Pose2) -> tuple[F64, F64]:
+    """Sensor origins (N, 2) and turns (N,) in the reference frame, from base poses (N, 3)."""
+    cos, sin = np.cos(odom_from_base[:, 2]), np.sin(odom_from_base[:, 2])
+    x = odom_from_base[:, 0] + cos * base_from_sensor.x_m - sin * base_from_sensor.y_m
+    y = odom_from_base[:, 1] + sin * base_from_sensor.x_m + cos * base_from_sensor.y_m
+    yaw = odom_from_base[:, 2] + base_from_sensor.yaw_rad
+    origin = odom_from_reference.inverse().apply(np.stack((x, y), axis=-1))
+    return origin, wrap_angles(yaw - odom_from_reference.yaw_rad)
