@@ -3,7 +3,7 @@
 Source: CiA 301 (application layer: NMT, SDO, PDO, EMCY, error control) and CiA 406 tables as in public encoder
 descriptions; exchanges recorded with a third-party master.
 
-    000          NMT command: 01 start, 02 stop, 80 pre-operational, 81 reset node, 82 reset communication; node, 0 = all
+    000          NMT command (01 start, 02 stop, 80 pre-operational, 81 reset node, 82 reset communication), node or 0
     080          SYNC                          080+n  emergency
     180+n, 280+n position, cyclic or on change (TPDO1), on SYNC (TPDO2)
     600+n/580+n  SDO request and answer        700+n  boot-up, heartbeat; node guarding by remote frame
@@ -232,7 +232,7 @@ class Cia406Encoder:
             self._restore(self._stored)
             self._begin_boot(now_ns)
         elif command == 0x82:
-            self._restore({key: value for key, value in self._stored.items() if key[0] < 0x2000})
+            self._restore({key: value for key, value in self._stored.items() if 0x1000 <= key[0] < 0x2000})
             self._begin_boot(now_ns)
         if self.state != OPERATIONAL:
             for pdo in self._pdos:
@@ -458,7 +458,7 @@ class Cia406Encoder:
 
     def _after_write(self, key: Key, value: int, now_ns: int) -> None:
         """What a new value sets going."""
-        index, sub = key
+        index = key[0]
         if index == 0x1003:
             self._errors.clear()
         elif index == 0x1010:
