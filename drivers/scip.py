@@ -38,6 +38,7 @@ U8 = NDArray[np.uint8]
 I32 = NDArray[np.int32]
 
 STAMP_WRAP_MS = 1 << 24  # 4 characters of 6 bits: 16 777.216 s
+SHORT_MAX_MM = 4095  # the largest number that MS and GS can say
 MAX_REPLY_BYTES = 1 << 16  # the longest reply known has 27 kB (4 321 steps with intensities)
 _BLOCK = 64
 _ROW = _BLOCK + 2  # a block, its sum, LF
@@ -74,7 +75,10 @@ class CodeTable(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """A laser's parameters as its `PP` gives them. Steps count counter-clockwise; step 0 looks to the rear."""
+    """A laser's parameters as its `PP` gives them. Steps count counter-clockwise; step 0 looks to the rear.
+
+    near_limit_mm, far_limit_mm: narrower limits than the device's own, if the user wants such.
+    """
 
     model: str
     range_min_mm: int
@@ -85,6 +89,18 @@ class Profile:
     front_step: int
     turns_per_minute: float
     codes: CodeTable
+    near_limit_mm: int = 0
+    far_limit_mm: int = 1 << 18
+
+    @property
+    def near_mm(self) -> int:
+        """The least distance that counts as one; what is nearer is too close."""
+        return max(self.range_min_mm, self.near_limit_mm)
+
+    @property
+    def far_mm(self) -> int:
+        """The largest distance that counts as one."""
+        return min(self.range_max_mm, self.far_limit_mm)
 
     @property
     def turn_ns(self) -> float:
@@ -312,11 +328,11 @@ def decode_scan(scan: RawScan, profile: Profile) -> Sweep:
     """
     numbers = _numbers(scan)
     distance_mm, intensity = numbers[0], numbers[1] if len(numbers) == 2 else None
-    range_m: F64 = distance_mm.astype(np.float64) * 1e-3
-    low = distance_mm < profile.range_min_mm
+    range_m: F64 = distance_mm / 1000.0
+    low = distance_mm < profile.near_mm
     if low.any():
-        range_m[low] = _code_ranges(profile.codes, profile.range_min_mm)[distance_mm[low]]
-    limit_mm = profile.range_max_mm if scan.request.value_chars != 2 else min(profile.range_max_mm, 4094)
+        range_m[low] = _near_ranges(profile.codes, profile.range_min_mm, profile.near_mm)[distance_mm[low]]
+    limit_mm = profile.far_mm if scan.request.value_chars != 2 else min(profile.far_mm, SHORT_MAX_MM - 1)
     high = distance_mm > limit_mm
     odd = 0
     if high.any():
@@ -335,14 +351,13 @@ def _numbers(scan: RawScan) -> tuple[I32, ...]:
 
 
 @lru_cache(maxsize=16)
-def _code_ranges(codes: CodeTable, range_min_mm: int) -> F64:
+def _near_ranges(codes: CodeTable, range_min_mm: int, near_mm: int) -> F64:
+    """(near_mm,) what each number below near_mm means: a code, or from range_min_mm on an echo that is too close."""
     nothing_seen, too_close = codes.value
-    table = np.full(max(range_min_mm, 1), np.nan)
-    for code in range(range_min_mm):
-        if code in nothing_seen:
-            table[code] = np.inf
-        elif code in too_close:
-            table[code] = -np.inf
+    table = np.full(near_mm, np.nan)
+    table[range_min_mm:] = -np.inf
+    table[[code for code in nothing_seen if code < range_min_mm]] = np.inf
+    table[[code for code in too_close if code < range_min_mm]] = -np.inf
     return table
 
 
