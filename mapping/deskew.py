@@ -35,7 +35,8 @@ class Deskewed:
 
 def beam_stamps(scan: Scan) -> NDArray[np.int64]:
     """(N,) when each beam was measured."""
-    return scan.stamp_ns + np.rint(np.arange(len(scan.bearing_rad)) * scan.beam_period_ns).astype(np.int64)
+    late = np.rint(np.arange(len(scan.bearing_rad)) * scan.beam_period_ns).astype(np.int64)
+    return np.asarray(scan.stamp_ns + late)
 
 
 def deskew(scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> Deskewed:

@@ -166,7 +166,7 @@ class Pose3:
 
     @staticmethod
     def from_matrix(matrix: ArrayLike) -> Pose3:
-        """The pose of a (4, 4) homogeneous matrix. At pitch = +-90 degrees roll is taken as 0. ValueError on other shapes."""
+        """The pose of a (4, 4) homogeneous matrix. Roll is 0 at pitch +-90 degrees. ValueError on other shapes."""
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape != (4, 4):
             raise ValueError(f"a spatial pose's matrix is (4, 4), got {m.shape}")
