@@ -1,0 +1,288 @@
+"""The publisher against real Zenoh clients on loopback: what is offered arrives, late joiners and get() included."""
+
+from __future__ import annotations
+
+import io
+import json
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapping.frames import Pose2
+from mapping.grids.patch import GridPatch
+from mapping.scan import Scan
+from service import cdr
+from service.clock import SystemClock
+from service.outputs import GridOut, GridUpdateOut, HealthOut, Output, PoseOut, ScanOut
+from service.payloads import RobotInfo
+from service.publisher import Publisher
+from service.rpc import CallRefused
+from service.zenoh_session import CallFailed, Client, NetworkSettings, NetworkTrouble, NoDaemon, PortInUse, received
+
+BASE = "robots/r1"
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def wait_until(condition: Callable[[], Any], seconds: float = 5.0) -> Any:
+    """What the condition gives, as soon as it is true; fails after that many seconds."""
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.005)
+    return value
+
+
+def offer_until_it_arrives(publisher: Publisher, output: Output, subscriber: Any) -> list[Any]:
+    """Offer again and again: the first ones may be sent before the subscription is known to the router."""
+
+    def arrived() -> list[Any]:
+        publisher.offer(output)
+        return drain(subscriber)
+
+    return list(wait_until(arrived))
+
+
+def drain(subscriber: Any) -> list[Any]:
+    samples = []
+    while (sample := subscriber.try_recv()) is not None:
+        samples.append(received(sample))
+    return samples
+
+
+def scan_out(stamp_ns: int = 1, sensor: str = "front") -> ScanOut:
+    return ScanOut(sensor, Scan(stamp_ns, 0.0, np.linspace(-1, 1, 11), np.full(11, 2.0), 0.1, 30.0), Pose2(), 0.0)
+
+
+def grid_out(epoch: int, value: int = 0, shape: tuple[int, int] = (3, 4)) -> GridOut:
+    return GridOut(epoch, epoch, GridPatch(0.05, -1, -2, np.full(shape, value, np.int8)))
+
+
+def health_out(text: str = "fine") -> HealthOut:
+    return HealthOut(1, 0, text, (), {}, {})
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def publisher(endpoint: str) -> Iterator[Publisher]:
+    made = Publisher(BASE, NetworkSettings(listen=(endpoint,)), clock=SystemClock())
+
+    def add(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        return {"sum": arguments["a"] + arguments["b"]}
+
+    def decline(_arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        raise CallRefused("not today: the map is empty")
+
+    made.calls.register("add", add)
+    made.calls.register("decline", decline)
+    made.start()
+    yield made
+    assert made.close()
+
+
+@pytest.fixture
+def client(publisher: Publisher, endpoint: str) -> Iterator[Client]:
+    with Client(endpoint) as opened:
+        yield opened
+
+
+def test_a_stream_arrives(publisher: Publisher, client: Client) -> None:
+    subscriber = client.subscribe(f"{BASE}/scan/**")
+    samples = offer_until_it_arrives(publisher, scan_out(stamp_ns=77), subscriber)
+    assert samples[0].key == f"{BASE}/scan/front"
+    assert samples[0].encoding == "application/cdr;sensor_msgs/msg/LaserScan"
+    laser = cdr.decode_laser(samples[0].payload)
+    assert laser.frame == "front"
+    assert abs(laser.stamp_ns - 77 - SystemClock().wall_from_monotonic_ns(0)) < 1_000_000_000
+
+
+def test_a_late_joiner_has_every_last_value(publisher: Publisher, client: Client) -> None:
+    publisher.publish_info(RobotInfo("r1", BASE, "0", 0))
+    for epoch in (1, 2, 3):
+        publisher.offer(grid_out(epoch, value=epoch))
+        publisher.offer(health_out(f"state {epoch}"))
+        wait_until(partial(kept_epoch, client, epoch))
+    late = client.subscribe_latched(f"{BASE}/**", ring=64)
+    seen: dict[str, Any] = {}
+
+    def complete() -> bool:
+        seen.update({sample.key.removeprefix(f"{BASE}/"): sample for sample in drain(late)})
+        return {"map/grid", "health", "health/json", "info", "tf/static"} <= set(seen)
+
+    wait_until(complete)
+    assert cdr.decode_grid(seen["map/grid"].payload).cells.tolist() == [[3] * 4] * 3
+    assert struct.unpack("<QQ", seen["map/grid"].attachment) == (3, 0)
+    assert json.loads(seen["health/json"].payload)["text"] == "state 3"
+
+
+def kept_epoch(client: Client, epoch: int) -> bool:
+    answers = client.get(f"{BASE}/map/grid")
+    return bool(answers) and struct.unpack("<QQ", answers[0].attachment or b"") == (epoch, 0)
+
+
+def test_get_gives_the_last_values_on_their_own_keys(publisher: Publisher, client: Client) -> None:
+    publisher.offer(grid_out(1))
+    publisher.offer(health_out())
+    publisher.offer(PoseOut(1, Pose2(1, 2, 3), Pose2(), np.eye(3)))
+    keys = {"map/grid", "health", "health/json", "pose", "tf"}
+
+    def everything() -> set[str]:
+        return {answer.key.removeprefix(f"{BASE}/") for answer in client.get(f"{BASE}/**")}
+
+    wait_until(lambda: keys <= everything())
+    assert [answer.key for answer in client.get(f"{BASE}/map/**")] == [f"{BASE}/map/grid"]
+    assert client.get(f"{BASE}/nothing") == []
+    assert client.get("robots/other/**") == []
+
+
+def test_get_converts_the_grid(publisher: Publisher, client: Client) -> None:
+    cells = np.array([[0, 0, 100], [-1, 50, 0]], np.int8)
+    publisher.offer(GridOut(1, 1, GridPatch(0.1, 2, -3, cells)))
+    wait_until(lambda: client.get(f"{BASE}/map/grid"))
+    (pgm,) = client.get(f"{BASE}/map/grid?format=pgm")
+    assert pgm.payload == b"P5\n3 2\n255\n" + bytes([205, 205, 254, 254, 254, 0])
+    assert pgm.encoding == "image/x-portable-graymap"
+    properties = json.loads(pgm.attachment or b"")
+    assert properties["origin"] == {"x_m": -0.3, "y_m": 0.2, "yaw_rad": 0.0}
+    (npy,) = client.get(f"{BASE}/map/grid?format=npy")
+    np.testing.assert_array_equal(np.load(io.BytesIO(npy.payload)), cells)
+    (png,) = client.get(f"{BASE}/map/**?format=png;max_age=1e6")
+    assert png.payload.startswith(b"\x89PNG")
+    (document,) = client.get(f"{BASE}/map/grid?format=json")
+    assert json.loads(document.payload)["cells"] == cells.tolist()
+    assert client.get(f"{BASE}/map/grid?format=bmp") == []
+    assert publisher.counters().get("queries_failed", 0) == 0
+
+
+def test_max_age_leaves_out_what_is_older(publisher: Publisher, client: Client) -> None:
+    clock = SystemClock()
+    publisher.offer(scan_out(clock.now_ns() - 60_000_000_000, "old"))
+    publisher.offer(scan_out(clock.now_ns(), "new"))
+    wait_until(lambda: len(client.get(f"{BASE}/scan/*")) == 2)
+    assert [answer.key for answer in client.get(f"{BASE}/scan/*?max_age=30")] == [f"{BASE}/scan/new"]
+
+
+def test_updates_arrive_in_order_behind_their_grid(publisher: Publisher, client: Client) -> None:
+    subscriber = client.subscribe(f"{BASE}/map/**", ring=256)
+    offer_until_it_arrives(publisher, grid_out(1, -1, (40, 40)), subscriber)
+    for row in range(30):
+        patch = GridPatch(0.05, row - 1, -2, np.full((1, 5), row, np.int8))
+        publisher.offer(GridUpdateOut(1, 1, patch))
+    updates: list[Any] = []
+
+    def all_there() -> bool:
+        updates.extend(sample for sample in drain(subscriber) if sample.key.endswith("/update"))
+        return len(updates) >= 30
+
+    wait_until(all_there)
+    assert [struct.unpack("<QQ", sample.attachment) for sample in updates] == [(1, n) for n in range(1, 31)]
+    assert [cdr.decode_grid_update(sample.payload).y for sample in updates] == list(range(30))
+
+
+def test_calls_answer_or_say_why_not(publisher: Publisher, client: Client) -> None:
+    assert client.call(BASE, "add", {"a": 2, "b": 3}) == {"sum": 5}
+    with pytest.raises(CallFailed, match="not today: the map is empty"):
+        client.call(BASE, "decline")
+    with pytest.raises(CallFailed, match="add, decline"):
+        client.call(BASE, "unknown")
+    with pytest.raises(CallFailed, match="KeyError"):
+        client.call(BASE, "add", {"a": 1})
+    with pytest.raises(CallFailed, match="does not answer"):
+        client.call("robots/other", "add", timeout_s=0.5)
+    assert client.call(BASE, "add", {"a": 1, "b": 1}) == {"sum": 2}
+    assert publisher.counters()["calls_failed"] == 3
+
+
+def test_a_wildcard_get_calls_nothing(publisher: Publisher, client: Client) -> None:
+    client.get(f"{BASE}/**")
+    client.get("**")
+    client.get("**/@rpc/**", timeout_s=0.5)  # no call has such a name
+    counters = publisher.counters()
+    assert counters["calls_answered"] == 0
+
+
+def test_alive_while_it_lives(endpoint: str) -> None:
+    publisher = Publisher(BASE, NetworkSettings(listen=(endpoint,)), clock=SystemClock())
+    publisher.start()
+    with Client(endpoint) as client:
+        assert wait_until(client.bases) == [BASE]
+        assert client.only_base() == BASE
+        assert client.only_base("robots/x") == "robots/x"
+        publisher.close()
+        with pytest.raises(NoDaemon):
+            client.only_base()
+
+
+def test_a_port_in_use_names_the_repair(publisher: Publisher, endpoint: str) -> None:
+    second = Publisher("robots/r2", NetworkSettings(listen=(endpoint,)), clock=SystemClock())
+    with pytest.raises(PortInUse, match=r"another daemon or Zenoh router.*\[network\] listen"):
+        second.start()
+    assert second.close()
+
+
+def test_no_daemon_names_the_repair(endpoint: str) -> None:
+    with pytest.raises(NoDaemon, match="umfeld run"):
+        Client(endpoint)
+
+
+def test_listening_to_the_world_needs_certificates() -> None:
+    with pytest.raises(NetworkTrouble, match="without a certificate"):
+        Publisher(BASE, NetworkSettings(listen=("tcp/0.0.0.0:0",)), clock=SystemClock()).start()
+
+
+def test_a_frozen_client_holds_up_nobody(publisher: Publisher, endpoint: str) -> None:
+    """A subscriber whose callback never returns: offers stay immediate and others go on receiving."""
+    released = threading.Event()
+    with Client(endpoint) as frozen, Client(endpoint) as lively:
+        frozen.session.declare_subscriber(f"{BASE}/**", lambda _sample: released.wait(20))
+        subscriber = lively.subscribe(f"{BASE}/scan/**", ring=2000)
+        offer_until_it_arrives(publisher, scan_out(), subscriber)
+        big = grid_out(1, 0, (1000, 1000))
+        longest, count = 0.0, 0
+        for number in range(150):
+            begin = time.monotonic()
+            publisher.offer(scan_out(number))
+            publisher.offer(big)
+            longest = max(longest, time.monotonic() - begin)
+            time.sleep(0.005)
+            count += len(drain(subscriber))
+        released.set()
+        assert longest < 0.2
+        assert count > 50
+
+
+def test_close_is_quick_and_final(endpoint: str) -> None:
+    publisher = Publisher(BASE, NetworkSettings(listen=(endpoint,)), clock=SystemClock())
+    publisher.start()
+    publisher.offer(grid_out(1))
+    begin = time.monotonic()
+    assert publisher.close(3.0)
+    assert time.monotonic() - begin < 3.0
+    publisher.offer(grid_out(2))  # afterwards offers go nowhere, without an error
+    again = Publisher(BASE, NetworkSettings(listen=(endpoint,)), clock=SystemClock())
+    again.start()  # the port is free at once
+    assert again.close()
+
+
+def test_a_bad_value_is_counted_and_silences_nothing(publisher: Publisher, client: Client) -> None:
+    subscriber = client.subscribe(f"{BASE}/scan/**")
+    offer_until_it_arrives(publisher, scan_out(), subscriber)
+    publisher.offer(PoseOut(1, Pose2(), Pose2(), np.eye(2)))  # a covariance of the wrong shape
+    wait_until(lambda: publisher.counters().get("not_sent_errors"))
+    publisher.offer(scan_out(2))
+    wait_until(lambda: drain(subscriber))
