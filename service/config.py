@@ -76,10 +76,13 @@ class Drive(Section):
         description="Counts per turn of the left wheel, gear included; negative if they fall rolling forward.",
     )
     ticks_per_turn_right: float = Field(default=4096.0, description="The same for the right wheel.")
-    wheel_noise_m_per_sqrt_m: Positive = Field(
-        default=0.01,
-        description="Standard deviation of a wheel's travel after one metre; grows with the root of the distance.",
+    travel_noise_m_per_sqrt_m: Positive = Field(
+        default=0.01, description="Standard deviation of a wheel's travel after 1 m; grows with the root of the way."
     )
+    unknown_speed_m_s: Positive = Field(
+        default=1.0, description="How fast it may have moved while counts were missing."
+    )
+    unknown_turn_rad_s: Positive = Field(default=1.0, description="How fast it may have turned meanwhile.")
     max_wheel_speed_m_s: Positive = Field(
         default=5.0, description="Faster counting is dropped as a fault of the encoder."
     )
@@ -153,17 +156,31 @@ class HokuyoLaser(Device):
 
     driver: Literal["hokuyo"] = Field(description="Says that it is this kind of device.")
     port: str = Field(min_length=1, description="Serial port, best by a stable name: /dev/serial/by-id/...")
-    baud_bps: int = Field(
-        default=115200, ge=1200, le=4000000, description="Line speed on RS-232; without meaning on USB."
+    baud_bps: int | None = Field(
+        default=None, ge=1200, le=4000000, description="Line speed to try first on RS-232; default: all of them."
     )
-    intensity: bool = Field(default=False, description="Ask for intensities as well (UTM-30LX and kin).")
+    intensity: bool = Field(default=False, description="Ask for intensities where the device has them (UTM-30LX).")
     mount: Mount = Field(default=Mount(), description="Where the laser sits.")
-    range_max_m: Positive | None = Field(
-        default=None, description="Ignore echoes beyond; default: the device's own limit."
+    first_step: int | None = Field(default=None, ge=0, description="Narrows the field: first step of the device's own.")
+    last_step: int | None = Field(default=None, ge=0, description="Narrows the field: last step.")
+    cluster: int | None = Field(default=None, ge=1, le=99, description="Steps joined to one beam; default: none.")
+    skip_scans: int | None = Field(
+        default=None, ge=0, le=9, description="Scans left out between two; default: what the line's speed asks for."
     )
+    range_min_m: float | None = Field(default=None, ge=0, description="Nearest echo; default: the device's own limit.")
+    range_max_m: Positive | None = Field(default=None, description="Farthest echo; default: the device's own limit.")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> HokuyoLaser:
+        for low, high in (("first_step", "last_step"), ("range_min_m", "range_max_m")):
+            lower, upper = getattr(self, low), getattr(self, high)
+            if lower is not None and upper is not None and lower >= upper:
+                raise ValueError(f"{low} must be below {high}")
+        return self
 
 
-LaserDevice = Annotated[HokuyoLaser, Field(description="A laser rangefinder.")]
+LaserDevice = HokuyoLaser
+"""Any laser: with a second kind, Annotated[First | Second, Field(discriminator="driver")]."""
 
 
 class Transducer(Section):
@@ -176,29 +193,21 @@ class Transducer(Section):
     yaw_deg: float = Field(default=0.0, ge=-360, le=360, description="Direction it looks in.")
 
 
-class UsBoardSonars(Device):
-    """Neobotix USBoard-USS5, an ultrasonic chain of up to 16 transducers, on CAN."""
+class _UsBoard(Device):
+    """What a USBoard is, whatever its link."""
 
-    driver: Literal["usboard"] = Field(description="Says that it is this kind of device.")
-    can: Name = Field(description="The [can.NAME] it is on.")
-    base_id: int = Field(
-        default=0x400, ge=0, le=0x7EF, description="First of its 17 CAN ids; second board usually 0x420."
+    sending: Literal["auto", "request", "listen"] = Field(
+        default="auto",
+        description="Who sets the pace. auto: as the board is set; request: we ask; listen: it sends by itself.",
     )
-    sending: Literal["request", "automatic"] = Field(
-        default="request", description="request: we ask for each round; automatic: the board sends by itself."
-    )
-    period_ms: int = Field(default=200, ge=40, le=2000, description="Time between two rounds.")
+    rate_hz: float = Field(default=10.0, gt=0, le=25, description="Rounds a second.")
     cone_deg: float = Field(default=30.0, gt=0, le=120, description="Full opening angle of a transducer.")
     range_min_m: float = Field(default=0.2, ge=0, description="Nearest distance a transducer measures.")
     range_max_m: Positive = Field(default=3.0, description="Farther echoes count as nothing seen.")
     transducers: tuple[Transducer, ...] = Field(default=(), max_length=16, description="The connected ones.")
 
-    def can_ids(self) -> frozenset[int]:
-        """Command id, answers and measuring groups: base to base + 10h."""
-        return frozenset(range(self.base_id, self.base_id + 0x11))
-
     @model_validator(mode="after")
-    def _sensible(self) -> UsBoardSonars:
+    def _sensible(self) -> _UsBoard:
         channels = [transducer.channel for transducer in self.transducers]
         for channel in channels:
             if channel > 16:
@@ -210,7 +219,26 @@ class UsBoardSonars(Device):
         return self
 
 
-SonarDevice = Annotated[UsBoardSonars, Field(description="An ultrasonic chain.")]
+class UsBoardSonars(_UsBoard):
+    """Neobotix USBoard or USBoard-USS5, an ultrasonic chain of up to 16 transducers, on CAN."""
+
+    driver: Literal["usboard"] = Field(description="Says that it is this kind of device.")
+    can: Name = Field(description="The [can.NAME] it is on.")
+    base_id: int = Field(default=0x400, ge=0, le=0x7EF, description="First of its 17 CAN ids; second board 0x420.")
+
+    def can_ids(self) -> frozenset[int]:
+        """Command id, answers and measuring groups: base to base + 10h."""
+        return frozenset(range(self.base_id, self.base_id + 0x11))
+
+
+class UsBoardSerialSonars(_UsBoard):
+    """The same board on its RS-232 or USB line."""
+
+    driver: Literal["usboard-serial"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description="Serial port, best by a stable name: /dev/serial/by-id/...")
+
+
+SonarDevice = Annotated[UsBoardSonars | UsBoardSerialSonars, Field(discriminator="driver")]
 
 
 class Cia406Wheels(Device):
@@ -220,7 +248,14 @@ class Cia406Wheels(Device):
     can: Name = Field(description="The [can.NAME] they are on.")
     node_left: int = Field(default=0x20, ge=1, le=127, description="Node id of the left wheel's encoder.")
     node_right: int = Field(default=0x21, ge=1, le=127, description="Node id of the right wheel's encoder.")
-    period_ms: int = Field(default=10, ge=5, le=200, description="Time between two SYNC messages, that is two samples.")
+    rate_hz: float = Field(default=100.0, ge=1, le=200, description="Samples a second.")
+    produce_sync: bool = Field(default=True, description="We send SYNC; false if another node on the bus does.")
+    sampling: Literal["auto", "sync", "cyclic"] = Field(
+        default="auto", description="What starts a sample: SYNC, the encoders' own timers, or SYNC where they have it."
+    )
+    max_turns_per_s: Positive = Field(
+        default=20.0, description="Of the encoder's shaft; bounds how long a gap may hide that the count wrapped."
+    )
 
     def can_ids(self) -> frozenset[int]:
         """The predefined connection set of both nodes; SYNC and NMT are shared by all."""

@@ -1,0 +1,106 @@
+"""`umfeld status`: what a running daemon says about itself, asked over Zenoh. Light: no numpy, no pydantic."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.errors import Trouble
+
+app = typer.Typer()
+
+_LEVEL_COLOURS = {"ok": "green", "warning": "yellow", "error": "red", "stale": "magenta"}
+
+
+@app.command()
+def status(
+    *,
+    connect: Annotated[
+        str | None, typer.Option(help="The daemon's endpoint; default: that of the configuration.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="The daemon's configuration file.")] = None,
+    robot: Annotated[str | None, typer.Option(help="The robot's id, where several answer.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """State, rates, ages, drops and pose of a running daemon. Exit code 1 if something is wrong there.
+
+    Example: umfeld status --json
+    """
+    from service.config_files import daemon_endpoint, find_config
+    from service.zenoh_session import Client
+
+    with Client(connect or daemon_endpoint(find_config(config))) as client:
+        base = client.only_base(None if robot is None else f"robots/{robot}")
+        values = {each.key.removeprefix(f"{base}/"): each.payload for each in client.get(f"{base}/health/json")}
+        values |= {each.key.removeprefix(f"{base}/"): each.payload for each in client.get(f"{base}/pose")}
+    if "health/json" not in values:
+        raise Trouble(f"{base} has said nothing about its health yet; try again in a second")
+    document = json.loads(values["health/json"])
+    document["base"] = base
+    document["pose"] = pose_in(values["pose"]) if "pose" in values else None
+    if as_json:
+        typer.echo(json.dumps(document, indent=2))
+    else:
+        _print(document)
+    if document["level"] != "ok":
+        raise typer.Exit(1)
+
+
+def pose_in(payload: bytes) -> dict[str, float]:
+    """x, y, yaw of a PoseWithCovarianceStamped in CDR: stamp, frame name, padding to 8 bytes, position, quaternion."""
+    little = "<" if payload[1] & 1 else ">"
+    body = payload[4:]
+    seconds, nanoseconds, length = struct.unpack_from(f"{little}iII", body)
+    x, y, _z, _qx, _qy, qz, qw = struct.unpack_from(f"{little}7d", body, (12 + length + 7) // 8 * 8)
+    return {"x_m": x, "y_m": y, "yaw_rad": 2.0 * math.atan2(qz, qw), "stamp_s": seconds + nanoseconds * 1e-9}
+
+
+def _print(document: Mapping[str, Any]) -> None:
+    process = document["process"]
+    typer.secho(f"{document['base']}: {document['text']}", fg=_LEVEL_COLOURS.get(document["level"]))
+    if (pose := document["pose"]) is not None:
+        typer.echo(
+            f"pose     x {pose['x_m']:.2f} m  y {pose['y_m']:.2f} m  yaw {math.degrees(pose['yaw_rad']):.1f} deg"
+        )
+    typer.echo(
+        f"process  {process.get('cpu_percent', 0):.0f} % of a core  {process.get('memory_mb', 0):.0f} MB"
+        f"  up {process.get('uptime_s', 0):.0f} s"
+    )
+    rows = [("device", "kind", "state", "rate", "age", "drops", "identity")]
+    rows += [_row(source) for source in document["sources"]]
+    print_table(rows, [None, *(_LEVEL_COLOURS.get(source["level"]) for source in document["sources"])])
+    lost = {name: count for name, count in document["counters"].items() if count and _is_loss(name)}
+    if lost:
+        typer.echo("lost     " + ", ".join(f"{name} {count}" for name, count in sorted(lost.items())))
+
+
+def _row(source: Mapping[str, Any]) -> tuple[str, str, str, str, str, str, str]:
+    age = source["age_s"]
+    drops = ", ".join(f"{reason} {count}" for reason, count in source["drops"].items() if count)
+    return (
+        source["name"],
+        source["kind"],
+        source["state"] if source["level"] == "ok" else f"{source['state']}: {source['text']}",
+        f"{source['rate_hz'] or 0:.1f} Hz",
+        "never" if age is None else f"{age:.2f} s",
+        drops or "-",
+        source["identity"] or "-",
+    )
+
+
+def _is_loss(name: str) -> bool:
+    return any(word in name for word in ("drop", "not_sent", "refused", "failed", "errors", "lost"))
+
+
+def print_table(rows: Sequence[Sequence[str]], colours: Sequence[str | None]) -> None:
+    """Columns as wide as their longest cell; the first row is the header."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row, colour in zip(rows, colours):
+        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip()
+        typer.secho(line, fg=colour, bold=row is rows[0])

@@ -1,0 +1,559 @@
+"""Readings in, maps updated, outputs out. No thread, socket or clock: time is handed in, the same items give the same
+outputs bit for bit.
+
+A laser's sweep goes three ways. As it is: ScanOut. At once into the sector maps, de-skewed with the odometry known by
+then; where odometry has not reached the last beams yet the newest pose is held, because a sector map that waits is
+late (at 100 Hz odometry the hold is 10 ms at most, 1 cm at 1 m/s). And into the grids, where a wrong place stays
+wrong for ever: there it waits until odometry covers the whole sweep, at most `wait_ns`, and is dropped otherwise.
+
+Input never stops fusion. What cannot be used is dropped and counted by source and reason:
+    stamp_equal, stamp_backward, stamp_ahead    not newer than the source's last, or from the future
+    wrong_count, no_beams, too_many_beams, bearing_not_finite, times_wrong, limits_wrong    a scan that is none
+    range_out_of_bounds    single beams: not positive, or beyond the device's limit; taken as INVALID
+    odometry_late, odometry_gone, odometry_broken, waiting_full    a scan that no pose belongs to, for the grids only
+    too_fast    wheel counts that no wheel can have made
+    unknown_channel, not_configured, wrong_kind    a reading from nowhere
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drivers.readings import ChainReading, DeviceEvent, LinkState, RangeStatus, Reading, ScanReading, WheelReading
+from mapping.deskew import Deskewed, deskew
+from mapping.frames import IDENTITY, Pose2, compose_covariance
+from mapping.odometry import DifferentialOdometry, DriveGeometry, OdometryState
+from mapping.pose_buffer import GoneError, PoseBuffer
+from mapping.scan import Scan
+from service.align import WaitingRoom
+from service.outputs import OdomOut, Output, PolarOut, PoseOut, RangesOut, RectOut, ScanOut
+from service.sensors import Chain, Laser, Sensor, Wheels
+
+F64 = NDArray[np.float64]
+
+SECOND = 1_000_000_000
+TICK_PERIOD_NS = 25_000_000  # how often tick() is to be called
+_AHEAD_LIMIT_NS = SECOND  # stamps farther in the future are nonsense
+_BEAMS_MAX = 100_000
+_SECTOR_PERIOD_NS = 100_000_000  # a sector map is published so often even if nothing feeds it
+_POSE_PERIOD_NS = 25_000_000
+_TOO_FAST_IN_A_ROW = 5  # then the counts are believed, and what lay between them is unknown
+_STALE_LIMIT_NS = 500_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Cone:
+    """What one sonar heard. range_m: +inf nothing up to range_max_m, -inf too close, NaN nothing known."""
+
+    base_from_transducer: Pose2
+    range_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Cones of one chain that were heard together."""
+
+    stamp_ns: int
+    cones: tuple[Cone, ...]
+    cone_rad: float
+    range_min_m: float
+    range_max_m: float
+
+
+class SectorLayer(Protocol):
+    """One sector map, polar or rectangular, as fusion sees it."""
+
+    @property
+    def sources(self) -> frozenset[str]:
+        """Names of the sensors that feed it."""
+
+    def take_scan(self, source: str, scan: Scan, base_from_sensor: Pose2, stale_after_ns: int) -> None:
+        """Replace what this source said. base_from_sensor: at the scan's stamp, seen from the base now."""
+
+    def take_round(self, source: str, heard: Round, stale_after_ns: int) -> None:
+        """The same for sonars; directions that are not in this round keep what they had."""
+
+    def lose(self, source: str, now_ns: int) -> None:
+        """The source is gone: what it said is stale from now on."""
+
+    def output(self, now_ns: int) -> PolarOut | RectOut:
+        """As it stands now, ages counted to now_ns."""
+
+
+class GridLayer(Protocol):
+    """A grid as fusion sees it; poses are those of the map frame."""
+
+    @property
+    def sources(self) -> frozenset[str]:
+        """Names of the sensors that draw it."""
+
+    def take_scan(self, scan: Scan, map_from_sensor: Pose2) -> None:
+        """Insert one de-skewed sweep."""
+
+    def take_round(self, heard: Round, map_from_base: Pose2) -> None:
+        """Insert the cones of one round."""
+
+    def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
+        """What is due for publication at now_ns. map_from_base: where the robot is, None while unknown."""
+
+
+class Localiser(Protocol):
+    """Where the odom frame lies in the map frame. Scan matching and SLAM take this seam."""
+
+    def take_odometry(self, state: OdometryState) -> None:
+        """Each new state, in order."""
+
+    def take_scan(self, sensor: str, swept: Deskewed, base_from_sensor: Pose2) -> None:
+        """Each sweep that odometry covers, in order of stamps, before it is put into the grids."""
+
+    def map_from_odom(self) -> tuple[Pose2, F64]:
+        """The correction as of now and its covariance (3, 3)."""
+
+
+class OdometryOnly:
+    """Believes the wheels: map and odom stay where they were put at the start."""
+
+    def __init__(self, map_from_odom: Pose2 = IDENTITY) -> None:
+        self._map_from_odom = map_from_odom
+
+    def take_odometry(self, state: OdometryState) -> None:
+        """Nothing to learn from it."""
+
+    def take_scan(self, sensor: str, swept: Deskewed, base_from_sensor: Pose2) -> None:
+        """Nothing to learn from it."""
+
+    def map_from_odom(self) -> tuple[Pose2, F64]:
+        return self._map_from_odom, np.zeros((3, 3))
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What fusion is made of.
+
+    drive: name of the source whose counts make odometry, and the geometry to read them by; without one the robot is
+    taken to stand still.  wait_ns: how long a sweep waits for odometry.
+    """
+
+    sensors: Mapping[str, Sensor]
+    sectors: Sequence[SectorLayer] = ()
+    grids: Sequence[GridLayer] = ()
+    drive: tuple[str, DriveGeometry] | None = None
+    max_wheel_speed_m_s: float = 5.0
+    localiser: Localiser = field(default_factory=OdometryOnly)
+    wait_ns: int = 500_000_000
+    odometry_memory_s: float = 30.0
+
+
+class Fusion:
+    """See the module's docstring. `drops`: by source and reason."""
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self.drops: dict[str, dict[str, int]] = {}
+        self._last_stamps: dict[str, int] = {}
+        self._waiting: WaitingRoom[Scan | Round] = WaitingRoom(limit_ns=parts.wait_ns)
+        self._chains = {
+            sensor.name: _ChainMemory(sensor) for sensor in parts.sensors.values() if isinstance(sensor, Chain)
+        }
+        self._odometry = None if parts.drive is None else DifferentialOdometry(parts.drive[1])
+        self._poses = PoseBuffer(capacity=max(64, int(parts.odometry_memory_s * 250)))
+        self._wheels_last: WheelReading | None = None
+        self._too_fast = 0
+        self._broken = False
+        self._state: OdometryState | None = None
+        self._pose_told_ns: int | None = None
+        self._sectors_told_ns: dict[int, int] = {}
+        self._sector_states: dict[int, bytes] = {}
+        self._newest_stamp_ns = 0
+        self._late_since_ns: int | None = None
+
+    # --- what comes in
+
+    def on_item(self, source: str, item: Reading | DeviceEvent, now_ns: int) -> list[Output]:
+        """Take one reading or event of a source; returns what it changes, in the order to publish."""
+        if isinstance(item, DeviceEvent):
+            return self._on_event(source, item, now_ns)
+        sensor = self._parts.sensors.get(source)
+        if sensor is None:
+            return self._drop(source, "not_configured")
+        match sensor, item:
+            case Laser(), ScanReading():
+                return self._on_scan(sensor, item, now_ns) if self._is_newer(source, item.stamp_ns, now_ns) else []
+            case Wheels(), WheelReading():
+                return self._on_wheels(sensor, item, now_ns) if self._is_newer(source, item.stamp_ns, now_ns) else []
+            case (
+                Chain(),
+                ChainReading(),
+            ):  # groups of a chain fire at the same time: its channels have stamps of their own
+                return self._on_round(sensor, item, now_ns)
+        return self._drop(source, "wrong_kind")
+
+    def tick(self, now_ns: int) -> list[Output]:
+        """To be called every TICK_PERIOD_NS: ages sectors, ends waiting, publishes grids that are due."""
+        outputs: list[Output] = []
+        for index, layer in enumerate(self._parts.sectors):
+            output = layer.output(now_ns)
+            overdue = now_ns - self._sectors_told_ns.get(index, -_SECTOR_PERIOD_NS) >= _SECTOR_PERIOD_NS
+            if overdue or self._sector_states.get(index) != output.snapshot.state.tobytes():
+                outputs.append(self._told(index, output, now_ns))
+        self._draw_what_is_covered(now_ns)
+        map_from_base = self._map_from_base_now()
+        for grid in self._parts.grids:
+            outputs.extend(grid.outputs(map_from_base, self._newest_stamp_ns, now_ns))
+        return outputs
+
+    def counters(self) -> dict[str, int]:
+        """Figures of fusion itself."""
+        return {"fusion.waiting_for_odometry": len(self._waiting)}
+
+    def troubles(self, now_ns: int) -> list[str]:
+        """What fusion waits for or lacks, each in one line with the repair."""
+        drive = self._parts.drive
+        if drive is None:
+            moving = any(grid.sources for grid in self._parts.grids)
+            return ["no [drive] source: the grid is drawn as if the robot stood still"] if moving else []
+        if self._late_since_ns is not None:
+            return [f"grids wait for odometry of {drive[0]}: check that device; scans are not drawn meanwhile"]
+        return []
+
+    def pose(self) -> Pose2 | None:
+        """The base in the map frame, None before the first odometry."""
+        return self._map_from_base_now()
+
+    # --- events
+
+    def _on_event(self, source: str, event: DeviceEvent, now_ns: int) -> list[Output]:
+        if event.state is LinkState.RUNNING or source not in self._parts.sensors:
+            return []
+        if event.state is LinkState.STARTING and source in self._chains:
+            self._chains[source].forget()
+        outputs: list[Output] = []
+        for index, layer in enumerate(self._parts.sectors):
+            if source in layer.sources:
+                layer.lose(source, now_ns)
+                outputs.append(self._told(index, layer.output(now_ns), now_ns))
+        return outputs
+
+    # --- lasers
+
+    def _on_scan(self, laser: Laser, reading: ScanReading, now_ns: int) -> list[Output]:
+        scan = self._checked_scan(laser, reading)
+        if scan is None:
+            return []
+        outputs: list[Output] = [ScanOut(laser.name, scan, laser.base_from_sensor, laser.height_m)]
+        limit_ns = stale_after_ns(reading.scan_period_ns, _last_beam_ns(scan) - scan.stamp_ns)
+        fed = [(index, layer) for index, layer in enumerate(self._parts.sectors) if laser.name in layer.sources]
+        if fed:
+            seen, base_from_sensor = self._as_seen_now(scan, laser.base_from_sensor)
+            for index, layer in fed:
+                layer.take_scan(laser.name, seen, base_from_sensor, limit_ns)
+                outputs.append(self._told(index, layer.output(now_ns), now_ns))
+        self._newest_stamp_ns = max(self._newest_stamp_ns, scan.stamp_ns)
+        self._draw_when_covered(laser.name, scan, scan.stamp_ns, _last_beam_ns(scan), now_ns)
+        return outputs
+
+    def _checked_scan(self, laser: Laser, reading: ScanReading) -> Scan | None:
+        bearing = np.asarray(reading.bearing_rad, dtype=np.float64)
+        distance = np.array(reading.range_m, dtype=np.float64)
+        reason = _fault_of_scan(reading, bearing, distance)
+        if reason is not None:
+            self._drop(laser.name, reason)
+            return None
+        measured = np.isfinite(distance)
+        impossible = measured & ((distance <= 0.0) | (distance > reading.range_max_m * (1.0 + 1e-9)))
+        if impossible.any():
+            distance[impossible] = np.nan
+            self._drop(laser.name, "range_out_of_bounds", int(impossible.sum()))
+        return Scan(
+            reading.stamp_ns,
+            float(reading.beam_period_ns),
+            -bearing if laser.upside_down else bearing,
+            distance,
+            float(reading.range_min_m),
+            float(reading.range_max_m),
+        )
+
+    def _as_seen_now(self, scan: Scan, base_from_sensor: Pose2) -> tuple[Scan, Pose2]:
+        """The scan de-skewed as far as odometry is known, and its sensor's pose as seen from where the base is now."""
+        if self._state is None or self._poses.newest_ns is None:
+            return scan, base_from_sensor
+        try:
+            swept = deskew(scan, _HeldPoses(self._poses), base_from_sensor)
+        except GoneError:
+            return scan, base_from_sensor
+        return swept.scan, self._state.odom_from_base.inverse() @ swept.odom_from_sensor
+
+    # --- sonars
+
+    def _on_round(self, chain: Chain, reading: ChainReading, now_ns: int) -> list[Output]:
+        memory = self._chains[chain.name]
+        if reading.stamp_ns > now_ns + _AHEAD_LIMIT_NS:
+            return self._drop(chain.name, "stamp_ahead")
+        cones, refused = memory.take(reading)
+        for reason in refused:
+            self._drop(chain.name, reason)
+        if not cones:
+            return []
+        heard = Round(reading.stamp_ns, cones, chain.cone_rad, chain.range_min_m, chain.range_max_m)
+        outputs: list[Output] = [memory.output(reading.stamp_ns)]
+        for index, layer in enumerate(self._parts.sectors):
+            if chain.name in layer.sources:
+                layer.take_round(chain.name, heard, memory.stale_after_ns)
+                outputs.append(self._told(index, layer.output(now_ns), now_ns))
+        self._newest_stamp_ns = max(self._newest_stamp_ns, reading.stamp_ns)
+        self._draw_when_covered(chain.name, heard, reading.stamp_ns, reading.stamp_ns, now_ns)
+        return outputs
+
+    # --- wheels
+
+    def _on_wheels(self, wheels: Wheels, reading: WheelReading, now_ns: int) -> list[Output]:
+        if self._odometry is None or self._parts.drive is None or wheels.name != self._parts.drive[0]:
+            return []
+        if self._is_too_fast(reading):
+            self._too_fast += 1
+            self._drop(wheels.name, "too_fast")
+            if self._too_fast <= _TOO_FAST_IN_A_ROW:
+                return []
+            reading = replace(reading, continuous=False)
+        self._too_fast = 0
+        self._wheels_last = reading
+        state = self._odometry.update(
+            reading.stamp_ns, reading.left_ticks, reading.right_ticks, continuous=reading.continuous
+        )
+        self._state = state
+        self._poses.add(state.stamp_ns, state.odom_from_base, after_break=state.broken)
+        self._parts.localiser.take_odometry(state)
+        outputs: list[Output] = [
+            OdomOut(state.stamp_ns, state.odom_from_base, state.covariance, state.forward_m_s, state.yaw_rad_s)
+        ]
+        if self._pose_told_ns is None or state.stamp_ns - self._pose_told_ns >= _POSE_PERIOD_NS:
+            self._pose_told_ns = state.stamp_ns
+            outputs.append(self._pose_of(state))
+        self._draw_what_is_covered(now_ns)
+        return outputs
+
+    def _is_too_fast(self, reading: WheelReading) -> bool:
+        last = self._wheels_last
+        if last is None or not reading.continuous or self._parts.drive is None:
+            return False
+        geometry = self._parts.drive[1]
+        reach_m = self._parts.max_wheel_speed_m_s * (reading.stamp_ns - last.stamp_ns) * 1e-9
+        left_m = (reading.left_ticks - last.left_ticks) * geometry.left_m_per_tick
+        right_m = (reading.right_ticks - last.right_ticks) * geometry.right_m_per_tick
+        # A tick of slack: the counter's step is not speed.
+        slack_m = abs(geometry.left_m_per_tick) + abs(geometry.right_m_per_tick)
+        return max(abs(left_m), abs(right_m)) > reach_m + slack_m
+
+    def _pose_of(self, state: OdometryState) -> PoseOut:
+        map_from_odom, covariance = self._parts.localiser.map_from_odom()
+        return PoseOut(
+            state.stamp_ns,
+            map_from_odom @ state.odom_from_base,
+            map_from_odom,
+            compose_covariance(map_from_odom, covariance, state.odom_from_base, state.covariance),
+        )
+
+    def _map_from_base_now(self) -> Pose2 | None:
+        map_from_odom, _ = self._parts.localiser.map_from_odom()
+        if self._odometry is None:
+            return map_from_odom
+        return None if self._state is None else map_from_odom @ self._state.odom_from_base
+
+    # --- grids
+
+    def _draw_when_covered(self, source: str, value: Scan | Round, first_ns: int, last_ns: int, now_ns: int) -> None:
+        if not any(source in grid.sources for grid in self._parts.grids):
+            return
+        if self._odometry is None:
+            self._draw_standing(source, value)
+            return
+        for lost, reason in self._waiting.put(source, value, first_ns, last_ns, now_ns):
+            self._drop(lost, reason)
+        self._draw_what_is_covered(now_ns)
+
+    def _draw_what_is_covered(self, now_ns: int) -> None:
+        if not len(self._waiting):
+            return
+        released = self._waiting.release(
+            oldest_ns=self._poses.oldest_ns, newest_ns=self._poses.newest_ns, now_ns=now_ns
+        )
+        for source, reason in released.dropped:
+            self._drop(source, reason)
+            if reason == "odometry_late":
+                self._late_since_ns = self._late_since_ns or now_ns
+        for source, value in released.ready:
+            self._late_since_ns = None
+            try:
+                self._draw_moving(source, value)
+            except GoneError:
+                self._drop(source, "odometry_broken")
+
+    def _draw_moving(self, source: str, value: Scan | Round) -> None:
+        """Raises GoneError if the track is broken under the sweep."""
+        if isinstance(value, Round):
+            odom_from_base = self._poses.at(value.stamp_ns)
+            self._insert_round(source, value, self._parts.localiser.map_from_odom()[0] @ odom_from_base)
+            return
+        laser = self._parts.sensors[source]
+        assert isinstance(laser, Laser)
+        swept = deskew(value, self._poses, laser.base_from_sensor)
+        self._parts.localiser.take_scan(source, swept, laser.base_from_sensor)
+        self._insert_scan(source, swept.scan, self._parts.localiser.map_from_odom()[0] @ swept.odom_from_sensor)
+
+    def _draw_standing(self, source: str, value: Scan | Round) -> None:
+        map_from_base, _ = self._parts.localiser.map_from_odom()
+        if isinstance(value, Round):
+            self._insert_round(source, value, map_from_base)
+            return
+        laser = self._parts.sensors[source]
+        assert isinstance(laser, Laser)
+        self._insert_scan(source, value, map_from_base @ laser.base_from_sensor)
+
+    def _insert_scan(self, source: str, scan: Scan, map_from_sensor: Pose2) -> None:
+        for grid in self._parts.grids:
+            if source in grid.sources:
+                grid.take_scan(scan, map_from_sensor)
+
+    def _insert_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
+        for grid in self._parts.grids:
+            if source in grid.sources:
+                grid.take_round(heard, map_from_base)
+
+    # --- small things
+
+    def _is_newer(self, source: str, stamp_ns: int, now_ns: int) -> bool:
+        """Whether a stamp follows the source's last one; counts it otherwise."""
+        last = self._last_stamps.get(source)
+        if stamp_ns > now_ns + _AHEAD_LIMIT_NS:
+            self._drop(source, "stamp_ahead")
+        elif last is not None and stamp_ns <= last:
+            self._drop(source, "stamp_equal" if stamp_ns == last else "stamp_backward")
+        else:
+            self._last_stamps[source] = stamp_ns
+            return True
+        return False
+
+    def _told(self, index: int, output: PolarOut | RectOut, now_ns: int) -> PolarOut | RectOut:
+        self._sectors_told_ns[index] = now_ns
+        self._sector_states[index] = output.snapshot.state.tobytes()
+        return output
+
+    def _drop(self, source: str, reason: str, count: int = 1) -> list[Output]:
+        reasons = self.drops.setdefault(source, {})
+        reasons[reason] = reasons.get(reason, 0) + count
+        return []
+
+
+class _HeldPoses(PoseBuffer):
+    """A pose buffer that answers with its newest pose for later times: for sector maps, which do not wait."""
+
+    def __init__(self, poses: PoseBuffer) -> None:
+        self._poses = poses
+
+    def at_many(self, stamp_ns: ArrayLike) -> F64:
+        return self._poses.at_many(np.minimum(np.asarray(stamp_ns, dtype=np.int64), self._poses.newest_ns or 0))
+
+
+class _ChainMemory:
+    """The newest range of every channel of a chain."""
+
+    def __init__(self, chain: Chain) -> None:
+        self._chain = chain
+        self._places = {each.channel: index for index, each in enumerate(chain.transducers)}
+        self.forget()
+
+    def forget(self) -> None:
+        """The chain starts anew: its stamps may too."""
+        count = len(self._places)
+        self._range_m = [math.nan] * count
+        self._stamp_ns: list[int | None] = [None] * count
+        self._interval_ns = float(self._chain.period_ns)
+
+    @property
+    def stale_after_ns(self) -> int:
+        """How long its ranges hold: by its rate, measured or as configured, whichever is slower."""
+        return stale_after_ns(int(max(self._interval_ns, self._chain.period_ns)), 0)
+
+    def take(self, reading: ChainReading) -> tuple[tuple[Cone, ...], list[str]]:
+        """The cones that are evidence of something, and a reason for every value that was refused."""
+        cones: list[Cone] = []
+        refused: list[str] = []
+        for heard in reading.ranges:
+            place = self._places.get(heard.channel)
+            if place is None:
+                if heard.status is not RangeStatus.NOT_LOOKED:
+                    refused.append("unknown_channel")
+                continue
+            last_ns = self._stamp_ns[place]
+            if last_ns is not None and reading.stamp_ns <= last_ns:
+                refused.append("stamp_equal" if reading.stamp_ns == last_ns else "stamp_backward")
+                continue
+            if last_ns is not None:
+                self._interval_ns += 0.2 * (min(reading.stamp_ns - last_ns, SECOND) - self._interval_ns)
+            self._stamp_ns[place] = reading.stamp_ns
+            range_m = self._range_of(heard.status, heard.range_m) if heard.heard_from is None else math.nan
+            self._range_m[place] = range_m
+            if not math.isnan(range_m):
+                cones.append(Cone(self._chain.transducers[place].base_from_transducer, range_m))
+        return tuple(cones), refused
+
+    def _range_of(self, status: RangeStatus, range_m: float) -> float:
+        """By the rule of readings.py, within the limits of this chain's transducers."""
+        match status:
+            case RangeStatus.NO_RETURN:
+                return math.inf
+            case RangeStatus.TOO_CLOSE:
+                return -math.inf
+            case RangeStatus.ECHO if math.isfinite(range_m) and range_m > 0.0:
+                if range_m > self._chain.range_max_m:
+                    return math.inf
+                return range_m if range_m >= self._chain.range_min_m else -math.inf
+        return math.nan
+
+    def output(self, now_ns: int) -> RangesOut:
+        """The whole chain; what is too old to be believed is NaN."""
+        chain, limit_ns = self._chain, self.stale_after_ns
+        fresh = (stamp_ns is not None and now_ns - stamp_ns <= limit_ns for stamp_ns in self._stamp_ns)
+        return RangesOut(
+            chain.name,
+            now_ns,
+            tuple(each.base_from_transducer for each in chain.transducers),
+            chain.cone_rad,
+            chain.range_min_m,
+            chain.range_max_m,
+            tuple(range_m if is_fresh else math.nan for range_m, is_fresh in zip(self._range_m, fresh)),
+        )
+
+
+def stale_after_ns(period_ns: int, sweep_ns: int) -> int:
+    """How old evidence may be, from its stamp: three periods after its sweep ended, never more than 500 ms."""
+    return min(3 * period_ns + sweep_ns, _STALE_LIMIT_NS) if period_ns > 0 else _STALE_LIMIT_NS
+
+
+def _last_beam_ns(scan: Scan) -> int:
+    return scan.stamp_ns + math.ceil((len(scan.bearing_rad) - 1) * scan.beam_period_ns)
+
+
+def _fault_of_scan(reading: ScanReading, bearing: F64, distance: F64) -> str | None:
+    """Why these arrays are no scan, or None."""
+    if bearing.ndim != 1 or distance.shape != bearing.shape:
+        return "wrong_count"
+    if len(bearing) == 0:
+        return "no_beams"
+    if len(bearing) > _BEAMS_MAX:
+        return "too_many_beams"
+    if not np.isfinite(bearing).all():
+        return "bearing_not_finite"
+    period = reading.beam_period_ns
+    if not math.isfinite(period) or not 0.0 <= period * len(bearing) <= 10 * SECOND:
+        return "times_wrong"
+    limits = (reading.range_min_m, reading.range_max_m)
+    if not all(math.isfinite(limit) for limit in limits) or not 0.0 <= limits[0] < limits[1]:
+        return "limits_wrong"
+    return None
