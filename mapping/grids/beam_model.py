@@ -1,0 +1,176 @@
+"""What a laser's beams prove about the cells they pass (S28).
+
+A beam is a narrow cone. Its end cell is evidence for an obstacle, the way there is evidence for free space:
+
+- Between two neighbouring beams that both returned, the wedge is free up to the shorter of the two, and only as far
+  as the beams are no farther apart than `fill_gap_m`. So a straight wall between two hits is never crossed, whatever
+  the angle at which it is seen, and a beam that is missing (NaN) leaves its surroundings unknown. Beams are
+  neighbours when no more than 1.5 times the device's spacing lies between them.
+- A beam that looks farther than its wedges (a lone beam, a gap between chair legs, beams far apart) frees the cells
+  its own line passes, no more.
+- A wedge frees the cells whose centre it contains, a line the cells it passes. A cell counts once per scan, and a
+  cell with a hit in it is not cleared by that scan.
+- +inf (nothing seen) is free up to range_max_m, if the device can be trusted to say so (`clear_no_return`). -inf (too
+  close) frees nothing and puts an obstacle at range_min_m, if one is given. NaN proves nothing, and neither does a
+  number below 0 or beyond range_max_m: a real measurement cannot be there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mapping.scan import Scan
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+NEIGHBOUR_FACTOR: Final = 1.5
+MAX_WEDGE_RAD: Final = 0.2  # farther apart, beams are separate sensors
+
+
+@dataclass(frozen=True, slots=True)
+class BeamTable:
+    """Directions of a device's beams by ascending bearing, made once per set of bearings.
+
+    bearing_rad: as given.  order: (N,) beam at each place of the table, None if they come in order.
+    dir_x, dir_y: (N,) unit vectors.  wedge_m: (N,) how far the wedge to the next entry (the last: to the first) may be
+    called looked through; 0 if they are not neighbours.
+    """
+
+    bearing_rad: F64
+    order: I64 | None
+    dir_x: F64
+    dir_y: F64
+    wedge_m: F64
+
+
+def beam_table(bearing_rad: F64, fill_gap_m: float) -> BeamTable:
+    """The table of a device. bearing_rad: (N,) finite, any order and direction; they may overlap by a full turn.
+
+    Raises ValueError if a bearing is not finite.
+    """
+    bearing = np.array(bearing_rad, dtype=np.float64)
+    if bearing.ndim != 1 or not np.all(np.isfinite(bearing)):
+        raise ValueError("bearing_rad is one row of finite angles")
+    turned = np.mod(bearing - bearing[0], 2.0 * np.pi) if bearing.size else bearing
+    order: I64 | None = None
+    if np.any(np.diff(turned) < 0.0):
+        order = np.argsort(turned, kind="stable")
+        turned = turned[order]
+    sorted_bearing = bearing if order is None else bearing[order]
+    gap = np.append(np.diff(turned), 2.0 * np.pi - turned[-1:] + turned[:1])
+    return BeamTable(
+        bearing_rad=bearing,
+        order=order,
+        dir_x=np.cos(sorted_bearing),
+        dir_y=np.sin(sorted_bearing),
+        wedge_m=_wedges(gap, fill_gap_m),
+    )
+
+
+def _wedges(gap_rad: F64, fill_gap_m: float) -> F64:
+    """How far the wedge after each beam may be filled. gap_rad: (N,) to the next beam, the last to the first."""
+    inner = gap_rad[:-1][gap_rad[:-1] > 0.0]
+    if inner.size == 0:
+        return np.zeros(gap_rad.size)
+    nominal = float(np.median(inner))
+    neighbours = gap_rad <= min(NEIGHBOUR_FACTOR * nominal, MAX_WEDGE_RAD)
+    return np.where(neighbours, fill_gap_m / np.maximum(gap_rad, 1e-9), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Beams:
+    """Beams in a common frame, each from its own place: what de-skewing makes of a scan.
+
+    origin_m, end_m: (N, 2), in the order of measurement, neighbours next to each other.  free: (N,) nothing stands
+    between them.  hit: (N,) an obstacle stands at end_m.  A beam that proves nothing is neither; its end may be NaN.
+    """
+
+    origin_m: F64
+    end_m: F64
+    free: Bools
+    hit: Bools
+
+
+def beams_of_scan(
+    scan: Scan, map_from_sensor: ArrayLike, *, clear_no_return: bool = True, use_max_m: float = np.inf
+) -> Beams:
+    """A scan whose sensor moved: each beam from the pose it was measured at.
+
+    map_from_sensor: (N, 3) x, y, yaw per beam (or (3,) for all); a beam whose pose is NaN proves nothing.
+    Raises ValueError for other shapes.
+    """
+    n = scan.range_m.size
+    pose = np.asarray(map_from_sensor, dtype=np.float64)
+    if pose.shape not in ((n, 3), (3,)):
+        raise ValueError(f"poses are (N, 3) with N = {n} beams, or (3,), got {pose.shape}")
+    pose = np.broadcast_to(pose, (n, 3))
+    reach = min(scan.range_max_m, use_max_m)
+    measured = (scan.range_m >= 0.0) & (scan.range_m <= scan.range_max_m)
+    nothing_seen = (scan.range_m == np.inf) & clear_no_return
+    too_close = (scan.range_m == -np.inf) & (scan.range_min_m > 0.0)
+    placed = np.all(np.isfinite(pose), axis=1)
+    length = np.where(measured, np.minimum(scan.range_m, reach), np.nan)
+    length = np.where(nothing_seen, reach, np.where(too_close, scan.range_min_m, length))
+    bearing = scan.bearing_rad + pose[:, 2]
+    end = pose[:, :2] + length[:, None] * np.stack((np.cos(bearing), np.sin(bearing)), axis=-1)
+    return Beams(
+        origin_m=np.ascontiguousarray(pose[:, :2]),
+        end_m=end,
+        free=(measured | nothing_seen) & placed,
+        hit=((measured & (scan.range_m <= reach)) | too_close) & placed,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Fan:
+    """Beams as seen from one place, by ascending bearing; lengths in metres, negative where nothing is known."""
+
+    dir_x: F64
+    dir_y: F64
+    wedge_m: F64
+    free_m: F64
+    hit_m: F64
+
+
+def fan_of_beams(beams: Beams, origin_m: F64, spread_m: float, fill_gap_m: float) -> Fan | None:
+    """Beams with nearly the same origin, drawn from origin_m; None if none proves anything.
+
+    spread_m: how far origins are from origin_m: free lengths without a hit at their end are cut by it.
+    """
+    some = np.flatnonzero(beams.free | beams.hit)
+    if some.size == 0:
+        return None
+    way = beams.end_m[some] - origin_m
+    length = np.hypot(way[:, 0], way[:, 1])
+    direction = np.where(length[:, None] > 0.0, way / np.maximum(length, 1e-300)[:, None], [1.0, 0.0])
+    bearing = np.arctan2(direction[:, 1], direction[:, 0])
+    turned = np.mod(bearing - bearing[0], 2.0 * np.pi)
+    order = np.argsort(turned, kind="stable")
+    gap = np.append(np.diff(turned[order]), 2.0 * np.pi - turned[order[-1]])
+    steps = np.abs(np.diff(some[order], append=some[order[:1]]))
+    adjacent = (steps == 1) | (steps == beams.free.size - 1)
+    wedge = _wedges_of(gap, adjacent, fill_gap_m)
+    hit, free = beams.hit[some], beams.free[some]
+    free_m = np.where(free, np.where(hit, length, np.maximum(length - spread_m, 0.0)), -1.0)
+    return Fan(
+        dir_x=np.ascontiguousarray(direction[order, 0]),
+        dir_y=np.ascontiguousarray(direction[order, 1]),
+        wedge_m=wedge,
+        free_m=free_m[order],
+        hit_m=np.where(hit, length, -1.0)[order],
+    )
+
+
+def _wedges_of(gap_rad: F64, adjacent: Bools, fill_gap_m: float) -> F64:
+    """As _wedges, where beams are neighbours only if they also were measured one after the other."""
+    if not np.any(adjacent):
+        return np.zeros(gap_rad.size)
+    nominal = float(np.median(gap_rad[adjacent]))
+    neighbours = adjacent & (gap_rad <= min(NEIGHBOUR_FACTOR * nominal, MAX_WEDGE_RAD))
+    return np.where(neighbours, fill_gap_m / np.maximum(gap_rad, 1e-9), 0.0)
