@@ -1,0 +1,688 @@
+"""Two CANopen encoders (CiA 406), one at each wheel of a differential drive, read together by SYNC.
+
+    id         what                                                 bytes
+    000        NMT, from us                                         01|80 nn: start, pre-operational
+    080        SYNC, from us                                        none
+    080 + n    emergency                                            code u16, register u8, 5 of the maker's
+    180 + n    TPDO1, by timer or on change                         position u32 (6004h)
+    280 + n    TPDO2, on SYNC                                       position u32 (6004h)
+    580/600+n  SDO answer and question                              see canopen_sdo.py
+    700 + n    heartbeat                                            00 boot-up, 7F pre-operational, 05 operational, 04
+
+Each node: pre-operational -> who are you (1000h, 1018h, 1008h), how do you count (6001h, 6002h) -> heartbeat 100 ms,
+TPDO2 on each SYNC -> start. When both are started we send SYNC at the wanted rate; a reading is complete when both have
+answered the same SYNC. A node that boots, falls silent or leaves the operational state is set up again.
+
+Why not the `canopen` package: it owns threads and the bus; what is needed of CiA 301 here is an SDO client and a few
+ids, which fit a conversation better. The package judges our SDO client in the tests instead.
+
+Source: CiA 301 (NMT, SDO, PDO, heartbeat, emergency), CiA 406 (objects 6000h to 650Dh).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+from functools import partial
+from typing import Literal
+
+from drivers.canopen_sdo import ANSWER_ID, TIMED_OUT, Download, SdoAborted, SdoClient, SdoDone, Upload
+from drivers.conversation import CanFrame, SetBaudRate
+from drivers.readings import ClockFit, Identity, LinkState, Reading, SourceCounters, WheelReading
+
+_SYNC_ID = 0x080
+_SYNC = CanFrame(_SYNC_ID)
+_NMT_START = 0x01
+_NMT_PRE_OPERATIONAL = 0x80
+_BOOT_UP, _OPERATIONAL = 0x00, 0x05
+_DEVICE_PROFILE = 406
+_POSITION_MAPPING = 0x60040020
+_PDO_DISABLED = 1 << 31
+_FULL_RANGE = 1 << 32
+
+_HEARTBEAT_MS = 100
+_LIFE_NS = 3 * _HEARTBEAT_MS * 1_000_000
+_SEARCH_PERIOD_NS = 250_000_000
+_REFUSED_RETRY_NS = 1_000_000_000
+_START_REPEAT_NS = 300_000_000
+_SYNC_PATIENCE_NS = 1_000_000_000  # started, alive, but no TPDO2 for so long: this node does not know SYNC
+_SHORTEST_ANSWER_LIMIT_NS = 50_000_000
+_LEAST_SILENCE_NS = 200_000_000  # a pause of the interpreter is no lost device
+_MOST_SILENCE_NS = 500_000_000
+_UNKNOWN_STEPS = 65536
+_JUMP_FACTOR = 10.0  # a count that moved ten times as far as the fastest wheel was set anew
+_NEVER = 1 << 62
+
+Sampling = Literal["auto", "sync", "cyclic"]
+"""auto: SYNC, and the timer of TPDO1 for nodes that do not answer SYNC. sync, cyclic: that one only."""
+
+
+# ---- counts
+
+
+class Unwrapper:
+    """A running total from a count that wraps, in both directions.
+
+    range_ticks: the count runs from 0 to range_ticks - 1.  steps_per_turn, max_turns_per_s: how fast it can move;
+    where it could have gone half the range since the last sample, its direction is not known any more.
+    """
+
+    def __init__(self, max_turns_per_s: float) -> None:
+        self.total = 0
+        self._max_turns_per_s = max_turns_per_s
+        self._stamp_ns = 0
+        self.configure(_FULL_RANGE, _UNKNOWN_STEPS)
+
+    def configure(self, range_ticks: int, steps_per_turn: int) -> None:
+        """The device has told how it counts; the next sample follows from nothing."""
+        self.range_ticks = range_ticks
+        self._ticks_per_ns = steps_per_turn * self._max_turns_per_s / 1e9
+        self._raw: int | None = None
+
+    def restart(self) -> None:
+        """The next sample follows from nothing."""
+        self._raw = None
+
+    def advance(self, raw: int, stamp_ns: int) -> bool:
+        """Take a sample; True if the total moved on by what was rolled since the last, False if that is not known."""
+        before, gap_ns = self._raw, max(stamp_ns - self._stamp_ns, 0)
+        self._raw, self._stamp_ns = raw, stamp_ns
+        if before is None:
+            return False
+        step = (raw - before) % self.range_ticks
+        if step > self.range_ticks // 2:
+            step -= self.range_ticks
+        farthest = self._ticks_per_ns * gap_ns
+        could_hide_a_wrap = 2 * farthest >= self.range_ticks
+        was_set_anew = abs(step) > _JUMP_FACTOR * max(farthest, self._ticks_per_ns * 20e6)
+        if could_hide_a_wrap or was_set_anew:
+            return False
+        self.total += step
+        return True
+
+
+# ---- one node
+
+
+class _Phase(Enum):
+    SEARCHING = auto()  # no answer yet, or no longer
+    SETTING_UP = auto()
+    STARTED = auto()
+
+
+Script = Generator[Upload | Download, SdoDone, None]
+
+
+class _Refused(Exception):  # noqa: N818 - never leaves this module
+    """Set-up cannot go on; the text says why and how to repair it."""
+
+
+class _Node:
+    """One encoder: found, set up, started, watched."""
+
+    def __init__(
+        self, node: int, side: str, counters: SourceCounters, *, period_ms: int, max_turns_per_s: float
+    ) -> None:
+        self.node = node
+        self.name = f"node {node:02X}h ({side} wheel)"
+        self._counters = counters
+        self._period_ms = period_ms
+        self._life_ns = max(_LIFE_NS, 3 * period_ms * 1_000_000)
+        self._sdo = SdoClient(node)
+        self.sync_pdo_id = 0x280 + node
+        self.cyclic_pdo_id = 0x180 + node
+        self.identity = Identity()
+        self.unwrapper = Unwrapper(max_turns_per_s)
+        self.begin(0, cyclic=False)
+
+    def begin(self, now_ns: int, *, cyclic: bool) -> None:
+        """Look for the node and set it up from the start."""
+        self.phase = _Phase.SEARCHING
+        self.cyclic = cyclic
+        self.answered = False
+        self.refusal: str | None = None
+        self.emergency: int | None = None
+        self.started_ns = 0
+        self._script: Script | None = None
+        self._search_due_ns = now_ns
+        self._heard_ns = now_ns
+        self._beats = False
+        self._start_due_ns = _NEVER
+        self._sdo.cancel()
+        self.unwrapper.restart()
+
+    def booted(self, now_ns: int) -> None:
+        """It has just been switched on or reset: what we set is gone, its count may be another."""
+        self._counters.drop("node_reset")
+        self.begin(now_ns, cyclic=self.cyclic)
+
+    @property
+    def trouble(self) -> str | None:
+        if self.refusal is not None:
+            return f"{self.name}: {self.refusal}"
+        if not self.answered:
+            return f"{self.name} does not answer: check its power, the wiring and termination, node id and bit rate"
+        if self.emergency is not None:
+            return f"{self.name} reports error {self.emergency:04X}h: see its manual for this emergency code"
+        return None
+
+    # ---- out
+
+    def requests(self, now_ns: int) -> list[CanFrame]:
+        self._notice_loss(now_ns)
+        frames: list[CanFrame] = []
+        if self.phase is _Phase.SEARCHING and now_ns >= self._search_due_ns:
+            self._search_due_ns = now_ns + _SEARCH_PERIOD_NS
+            self._script = self._set_up()
+            self._sdo.ask(next(self._script), now_ns)
+            self.phase = _Phase.SETTING_UP
+            frames.append(self._nmt(_NMT_PRE_OPERATIONAL))  # a stopped node does not answer SDO
+        sdo_frames, timed_out = self._sdo.requests(now_ns)
+        frames += sdo_frames
+        if timed_out is not None:
+            self._go_on(timed_out, now_ns)
+        if self.phase is _Phase.STARTED and now_ns >= self._start_due_ns:
+            self._start_due_ns = _NEVER
+            self.started_ns = now_ns
+            frames.append(self._nmt(_NMT_START))
+        return frames
+
+    def farewell(self) -> list[CanFrame]:
+        """Back to pre-operational: no more PDOs on the bus."""
+        return [self._nmt(_NMT_PRE_OPERATIONAL)] if self.phase is _Phase.STARTED else []
+
+    def _nmt(self, command: int) -> CanFrame:
+        return CanFrame(0, bytes((command, self.node)))
+
+    def _notice_loss(self, now_ns: int) -> None:
+        if self.phase is _Phase.STARTED and self._beats and now_ns - self._heard_ns > self._life_ns:
+            self._counters.drop("node_lost")
+            self.begin(now_ns, cyclic=self.cyclic)
+
+    # ---- in
+
+    def hear(self, now_ns: int) -> None:
+        """Any frame of the node is a sign of life."""
+        self._heard_ns = now_ns
+
+    def take_sdo(self, data: bytes, now_ns: int) -> None:
+        done = self._sdo.receive(data, now_ns)
+        if done is not None:
+            self._go_on(done, now_ns)
+
+    def take_heartbeat(self, data: bytes, now_ns: int) -> None:
+        if len(data) != 1:
+            self._counters.drop("wrong_length")
+            return
+        state = data[0] & 0x7F
+        if state == _BOOT_UP:
+            self.booted(now_ns)
+        elif state != _OPERATIONAL and self._start_overdue(now_ns):
+            self._counters.drop("not_operational")
+            self._start_due_ns = now_ns
+            self.unwrapper.restart()
+
+    def take_emergency(self, data: bytes) -> None:
+        if len(data) != 8:
+            self._counters.drop("wrong_length")
+            return
+        code = int.from_bytes(data[:2], "little")
+        self.emergency = code or None  # 0: the error is gone
+        if code:
+            self._counters.drop("emergency")
+
+    def position(self, data: bytes) -> int | None:
+        """The count in a PDO; None (and counted) if there is none in it."""
+        if len(data) < 4:
+            self._counters.drop("wrong_length")
+            return None
+        raw = int.from_bytes(data[:4], "little")
+        range_ticks = self.unwrapper.range_ticks
+        if raw >= range_ticks:
+            self._counters.drop("position_out_of_range")
+            self.refusal = f"its position exceeds its range of {range_ticks} (6002h): switch on scaling (6000h bit 2)"
+            return None
+        self.refusal = None
+        return raw
+
+    def _start_overdue(self, now_ns: int) -> bool:
+        return (
+            self.phase is _Phase.STARTED
+            and self._start_due_ns == _NEVER
+            and (now_ns - self.started_ns > _START_REPEAT_NS)
+        )
+
+    # ---- set-up
+
+    def _go_on(self, done: SdoDone, now_ns: int) -> None:
+        """An SDO transfer has ended: the next step of the set-up."""
+        if done.abort_code == TIMED_OUT:
+            self.begin(max(now_ns, self._search_due_ns), cyclic=self.cyclic)
+            return
+        if self._script is None:
+            return
+        self.answered = True
+        if not done.ok:
+            self._counters.drop("sdo_abort")
+        try:
+            self._sdo.ask(self._script.send(done), now_ns)
+        except StopIteration:
+            self._script = None
+            self.phase = _Phase.STARTED
+            self._start_due_ns = now_ns
+            self._heard_ns = now_ns
+        except (_Refused, SdoAborted) as error:
+            self._script = None
+            self.phase = _Phase.SEARCHING
+            self._search_due_ns = now_ns + _REFUSED_RETRY_NS
+            self.refusal = str(error)
+
+    def _set_up(self) -> Script:
+        """The questions and settings in order; each `yield` is one SDO transfer."""
+        kind = yield from _must(Upload(0x1000))
+        profile = kind & 0xFFFF
+        if profile != _DEVICE_PROFILE:
+            raise _Refused(f"device profile {profile} is not that of an encoder ({_DEVICE_PROFILE}): check the node id")
+        self.refusal = None
+        self.identity = yield from _ask_identity()
+        steps_per_turn = (yield from _number(Upload(0x6001))) or _UNKNOWN_STEPS
+        range_ticks = (yield from _number(Upload(0x6002))) or _FULL_RANGE
+        self.unwrapper.configure(range_ticks, steps_per_turn)
+        self._beats = yield from _set_heartbeat()  # without one, missing readings tell that it is gone
+        if self.cyclic:
+            self.cyclic_pdo_id = (yield from _pdo_id(0x1800)) or 0x180 + self.node
+            yield from _send_by_timer(self._period_ms)
+        else:
+            self.sync_pdo_id = (yield from _pdo_id(0x1801)) or 0x280 + self.node
+            yield from _send_on_sync()
+
+
+Steps = Generator[Upload | Download, SdoDone, int]
+
+
+def _must(question: Upload | Download) -> Steps:
+    """The answer's number; SdoAborted if the node refuses."""
+    done = yield question
+    if done.abort_code is not None:
+        raise SdoAborted(question, done.abort_code)
+    return done.number
+
+
+def _number(question: Upload) -> Steps:
+    """The answer's number, 0 if the node does not have the object."""
+    done = yield question
+    return done.number if done.ok else 0
+
+
+def _text(question: Upload) -> Generator[Upload | Download, SdoDone, str]:
+    done = yield question
+    return done.data.decode("ascii", "replace").strip("\0 ") if done.ok else ""
+
+
+def _ask_identity() -> Generator[Upload | Download, SdoDone, Identity]:
+    vendor = yield from _number(Upload(0x1018, 1))
+    product = yield from _number(Upload(0x1018, 2))
+    revision = yield from _number(Upload(0x1018, 3))
+    serial = yield from _number(Upload(0x1018, 4))
+    name = yield from _text(Upload(0x1008))
+    return Identity(
+        vendor=f"CANopen vendor {vendor:X}h",
+        model=name or f"product {product:X}h",
+        serial=str(serial),
+        firmware=f"revision {revision >> 16}.{revision & 0xFFFF}",
+    )
+
+
+def _set_heartbeat() -> Generator[Upload | Download, SdoDone, bool]:
+    """True if the node sends its heartbeat as often as we want."""
+    if (yield from _number(Upload(0x1017))) == _HEARTBEAT_MS:
+        return True
+    done = yield Download(0x1017, 0, _HEARTBEAT_MS.to_bytes(2, "little"))
+    return done.ok
+
+
+def _pdo_id(communication: int) -> Steps:
+    """The id under which a PDO is sent, 0 if the node does not say."""
+    cob_id = yield from _number(Upload(communication, 1))
+    return cob_id & 0x7FF
+
+
+def _send_on_sync() -> Generator[Upload | Download, SdoDone, None]:
+    """TPDO2: the position, after each SYNC. Writes only what is not so already: some nodes store each write."""
+    cob_id = yield from _number(Upload(0x1801, 1))
+    mapped = yield from _number(Upload(0x1A01, 1))
+    if mapped not in (0, _POSITION_MAPPING):
+        yield Download(0x1801, 1, (cob_id | _PDO_DISABLED).to_bytes(4, "little"))
+        yield Download(0x1A01, 0, b"\0")
+        yield Download(0x1A01, 1, _POSITION_MAPPING.to_bytes(4, "little"))
+        yield Download(0x1A01, 0, b"\1")
+        cob_id |= _PDO_DISABLED
+    kind = yield from _number(Upload(0x1801, 2))
+    if kind != 1:
+        done = yield Download(0x1801, 2, b"\1")
+        if not done.ok and not cob_id & _PDO_DISABLED:  # some take it only while the PDO is switched off
+            yield Download(0x1801, 1, (cob_id | _PDO_DISABLED).to_bytes(4, "little"))
+            cob_id |= _PDO_DISABLED
+            yield Download(0x1801, 2, b"\1")
+    if cob_id & _PDO_DISABLED:
+        yield Download(0x1801, 1, (cob_id & ~_PDO_DISABLED).to_bytes(4, "little"))
+
+
+def _send_by_timer(period_ms: int) -> Generator[Upload | Download, SdoDone, None]:
+    """TPDO1: the position, every period_ms. 6200h and 1800h:05 are the same timer; one of the two is enough."""
+    timer = period_ms.to_bytes(2, "little")
+    yield Download(0x1800, 2, b"\xfe")
+    first = yield Download(0x1800, 5, timer)
+    second = yield Download(0x6200, 0, timer)
+    if not first.ok and not second.ok:
+        raise _Refused("it takes no timer (1800h:05, 6200h) for its position: set one with the maker's tool")
+
+
+# ---- the pair
+
+
+@dataclass(slots=True)
+class _Round:
+    """One SYNC and what was answered to it: positions by side."""
+
+    sync_ns: int
+    raw: list[int | None]
+    first_answer_ns: int | None = None
+
+
+@dataclass(slots=True)
+class _Track:
+    """The two newest samples of a node that sends by timer: (stamp, total)."""
+
+    before: tuple[int, int] | None = None
+    newest: tuple[int, int] | None = None
+
+    def at(self, stamp_ns: int) -> int | None:
+        """The total at a time between the two, None outside."""
+        if self.newest is None:
+            return None
+        if stamp_ns == self.newest[0]:
+            return self.newest[1]
+        if self.before is None or not self.before[0] <= stamp_ns < self.newest[0]:
+            return None
+        (t0, x0), (t1, x1) = self.before, self.newest
+        return x0 + round((x1 - x0) * (stamp_ns - t0) / (t1 - t0))
+
+
+class Cia406PairConversation:
+    """The two wheel encoders of a differential drive. Counts are in the nodes' own directions: signs are configuration.
+
+    sync_rate_hz: of our SYNC, and so of the readings.  produce_sync: False where another member of the bus does it.
+    sampling: see Sampling.  max_turns_per_s: of the encoder's shaft; bounds how long a gap may hide a wrap.
+    """
+
+    def __init__(
+        self,
+        node_left: int,
+        node_right: int,
+        *,
+        sync_rate_hz: float = 100.0,
+        produce_sync: bool = True,
+        sampling: Sampling = "auto",
+        max_turns_per_s: float = 20.0,
+    ) -> None:
+        if node_left == node_right:
+            raise ValueError(f"both wheels are node {node_left:02X}h: each encoder needs a node id of its own")
+        if not 1.0 <= sync_rate_hz <= 1000.0:
+            raise ValueError(f"sync_rate_hz {sync_rate_hz}: 1 to 1000")
+        self._period_ns = round(1e9 / sync_rate_hz)
+        self._produce_sync = produce_sync
+        self._sampling = sampling
+        self._counters = SourceCounters()
+        self._last_stamp_ns = -_NEVER
+        period_ms = max(1, round(1e3 / sync_rate_hz))
+        self._nodes = [
+            _Node(node, side, self._counters, period_ms=period_ms, max_turns_per_s=max_turns_per_s)
+            for node, side in ((node_left, "left"), (node_right, "right"))
+        ]
+        self._restart(0)
+
+    # ---- what a conversation shows
+
+    @property
+    def state(self) -> LinkState:
+        if not all(node.answered for node in self._nodes):
+            return LinkState.SILENT
+        return LinkState.RUNNING if self._running and self._all_started() else LinkState.STARTING
+
+    @property
+    def trouble(self) -> str | None:
+        troubles = [trouble for node in self._nodes if (trouble := node.trouble) is not None]
+        if self._foreign_sync:
+            troubles.append("another member of the bus sends SYNC too: switch one of the two off (produce_sync)")
+        if self._fallen_back:
+            troubles.append("SYNC is not answered (TPDO2): reading by timer, the wheels are not sampled together")
+        return "; ".join(troubles) or None
+
+    @property
+    def identity(self) -> Identity | None:
+        left, right = (node.identity for node in self._nodes)
+        if left == Identity() or right == Identity():
+            return None
+        return Identity(*(_both(a, b) for a, b in zip(_fields(left), _fields(right))))
+
+    @property
+    def clock_fit(self) -> ClockFit | None:
+        """Encoders have no clock."""
+        return None
+
+    @property
+    def counters(self) -> SourceCounters:
+        return self._counters
+
+    @property
+    def silence_limit_ns(self) -> int:
+        return min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+
+    # ---- how it is driven
+
+    def connected(self, now_ns: int) -> None:
+        self._restart(now_ns)
+
+    def requests(self, now_ns: int) -> Sequence[CanFrame | SetBaudRate]:
+        frames = [frame for node in self._nodes for frame in node.requests(now_ns)]
+        if not self._all_started():
+            self._pause()
+        else:
+            self._notice_deafness(now_ns)
+            if self._sync_is_due(now_ns):
+                frames.append(_SYNC)
+        return frames
+
+    def next_request_ns(self) -> int:
+        """When the next SYNC is due, if it is not held back by answers still out."""
+        if self._cyclic or not self._produce_sync or not self._all_started():
+            return _NEVER
+        return self._sync_due_ns if self._round is None else self._round.sync_ns + self._answer_limit_ns()
+
+    def receive(self, chunk: CanFrame, stamp_ns: int) -> Iterator[Reading]:
+        handler = self._handlers.get(chunk.can_id)
+        if handler is None or chunk.extended or chunk.remote:
+            return iter(())
+        self._counters.chunks += 1
+        self._counters.bytes += len(chunk.data)
+        reading = handler(chunk.data, stamp_ns)
+        if reading is None:
+            return iter(())
+        self._running = True
+        self._counters.readings += 1
+        return iter((reading,))
+
+    def farewell(self) -> Sequence[CanFrame | SetBaudRate]:
+        """The nodes go back to pre-operational and send no more positions."""
+        return [frame for node in self._nodes for frame in node.farewell()]
+
+    # ---- beginning
+
+    def _restart(self, now_ns: int) -> None:
+        self._cyclic = self._sampling == "cyclic"
+        self._fallen_back = False
+        self._foreign_sync = False
+        self._begin_nodes(now_ns)
+
+    def _begin_nodes(self, now_ns: int) -> None:
+        for node in self._nodes:
+            node.begin(now_ns, cyclic=self._cyclic)
+        self._tracks = [_Track(), _Track()]
+        self._listen()
+        self._pause()
+
+    def _listen(self) -> None:
+        """Which id means what; others are ignored at the cost of one look-up."""
+        self._handlers: dict[int, Callable[[bytes, int], WheelReading | None]] = {_SYNC_ID: self._take_sync}
+        for side, node in enumerate(self._nodes):
+            self._handlers[node.sync_pdo_id] = partial(self._take_sync_pdo, side)
+            self._handlers[node.cyclic_pdo_id] = partial(self._take_timer_pdo, side)
+            self._handlers[ANSWER_ID + node.node] = partial(self._take_sdo, node)
+            self._handlers[0x700 + node.node] = partial(self._take_heartbeat, node)
+            self._handlers[0x080 + node.node] = partial(self._take_emergency, node)
+
+    def _pause(self) -> None:
+        """No readings until both nodes are started; the first one then follows from nothing."""
+        self._running = False
+        self._fresh = True
+        self._round: _Round | None = None
+        self._sync_due_ns = 0
+        self._deaf_since_ns: int | None = None
+
+    def _all_started(self) -> bool:
+        return all(node.phase is _Phase.STARTED for node in self._nodes)
+
+    # ---- sampling by SYNC
+
+    def _sync_is_due(self, now_ns: int) -> bool:
+        """Begin a round if it is time and the last one is answered: an answer can then belong to one SYNC only."""
+        if self._cyclic or not self._produce_sync:
+            return False
+        if self._round is not None:
+            if now_ns < self._round.sync_ns + self._answer_limit_ns():
+                return False
+            self._counters.drop("sync_unanswered")
+            self._round = None
+        if now_ns < self._sync_due_ns:
+            return False
+        late = now_ns - self._sync_due_ns > self._period_ns
+        self._sync_due_ns = (now_ns if late else self._sync_due_ns) + self._period_ns
+        self._round = _Round(now_ns, [None, None])
+        return True
+
+    def _answer_limit_ns(self) -> int:
+        return max(2 * self._period_ns, _SHORTEST_ANSWER_LIMIT_NS)
+
+    def _take_sync(self, data: bytes, stamp_ns: int) -> None:
+        if not self._produce_sync:
+            if self._round is not None:
+                self._counters.drop("sync_unanswered")
+            self._round = _Round(stamp_ns, [None, None])
+        elif self._round is None or self._round.first_answer_ns is not None:  # else it may be the echo of our own
+            self._foreign_sync = True
+            self._counters.drop("foreign_sync")
+
+    def _take_sync_pdo(self, side: int, data: bytes, stamp_ns: int) -> WheelReading | None:
+        node = self._nodes[side]
+        node.hear(stamp_ns)
+        if self._cyclic or not self._all_started():
+            return None
+        current = self._round
+        if current is None or current.raw[side] is not None:
+            self._counters.drop("extra_pdo")
+            return None
+        raw = node.position(data)
+        if raw is None:
+            return None
+        current.raw[side] = raw
+        if current.first_answer_ns is None:
+            current.first_answer_ns = stamp_ns
+        left, right = current.raw
+        if left is None or right is None:
+            return None
+        self._round = None
+        self._deaf_since_ns = stamp_ns
+        # Sampled when the nodes heard SYNC: between its sending and the first answer. The way there and back is about
+        # equally long (adapter, host), so the middle is right to within half their difference.
+        return self._reading(left, right, (current.sync_ns + current.first_answer_ns) // 2)
+
+    def _reading(self, left: int, right: int, stamp_ns: int) -> WheelReading:
+        stamp_ns = max(stamp_ns, self._last_stamp_ns + 1)
+        self._last_stamp_ns = stamp_ns
+        known = [node.unwrapper.advance(raw, stamp_ns) for node, raw in zip(self._nodes, (left, right))]
+        if not self._fresh and not all(known):
+            self._counters.drop("discontinuity")
+        continuous = all(known) and not self._fresh
+        self._fresh = False
+        return WheelReading(stamp_ns, self._nodes[0].unwrapper.total, self._nodes[1].unwrapper.total, continuous)
+
+    def _notice_deafness(self, now_ns: int) -> None:
+        """Both nodes live and are started, but SYNC brings no pair of positions: read them by timer instead."""
+        if self._cyclic or self._sampling != "auto":
+            return
+        if self._deaf_since_ns is None:
+            self._deaf_since_ns = now_ns
+        if self._running or now_ns - self._deaf_since_ns <= _SYNC_PATIENCE_NS:
+            return
+        self._cyclic = self._fallen_back = True
+        self._begin_nodes(now_ns)
+
+    # ---- sampling by timer
+
+    def _take_timer_pdo(self, side: int, data: bytes, stamp_ns: int) -> WheelReading | None:
+        node = self._nodes[side]
+        node.hear(stamp_ns)
+        if not self._cyclic or not self._all_started():
+            return None
+        raw = node.position(data)
+        if raw is None:
+            return None
+        track = self._tracks[side]
+        if not node.unwrapper.advance(raw, stamp_ns):
+            self._fresh = True
+            track.newest = None
+        track.before, track.newest = track.newest, (stamp_ns, node.unwrapper.total)
+        return self._interpolated()
+
+    def _interpolated(self) -> WheelReading | None:
+        """Both totals at the newest time that both are known for: the one that spoke later is interpolated."""
+        left, right = self._tracks
+        if left.newest is None or right.newest is None:
+            return None
+        stamp_ns = min(left.newest[0], right.newest[0])
+        left_ticks, right_ticks = left.at(stamp_ns), right.at(stamp_ns)
+        if stamp_ns <= self._last_stamp_ns or left_ticks is None or right_ticks is None:
+            return None
+        self._last_stamp_ns = stamp_ns
+        continuous = not self._fresh
+        self._fresh = False
+        return WheelReading(stamp_ns, left_ticks, right_ticks, continuous)
+
+    # ---- the rest of the nodes' frames
+
+    def _take_sdo(self, node: _Node, data: bytes, now_ns: int) -> None:
+        node.hear(now_ns)
+        node.take_sdo(data, now_ns)
+        if node.phase is _Phase.STARTED:
+            self._listen()  # it may have told other PDO ids
+
+    def _take_heartbeat(self, node: _Node, data: bytes, now_ns: int) -> None:
+        node.hear(now_ns)
+        node.take_heartbeat(data, now_ns)
+        if not self._all_started():
+            self._pause()
+
+    def _take_emergency(self, node: _Node, data: bytes, now_ns: int) -> None:
+        node.hear(now_ns)
+        node.take_emergency(data)
+
+
+def _fields(identity: Identity) -> tuple[str, str, str, str]:
+    return identity.vendor, identity.model, identity.serial, identity.firmware
+
+
+def _both(left: str, right: str) -> str:
+    """Told once if both wheels say the same."""
+    return left if left == right else f"{left} / {right}"
