@@ -76,11 +76,18 @@ class Trajectory:
         self.closed = closed
         self._pose = np.zeros((len(pieces) + 1, 3))
         self._way = np.zeros(len(pieces) + 1)
-        self._pose[0] = start
-        for k, piece in enumerate(pieces):
-            moved, turned, x, y = _moved(self._table[k : k + 1], np.array([piece.duration_s]), self._pose[k : k + 1])
-            self._pose[k + 1] = (x[0], y[0], self._pose[k, 2] + turned[0])
-            self._way[k + 1] = self._way[k] + moved[0]
+        self._chain(np.array(start, dtype=np.float64))
+
+    def _chain(self, start: F64) -> None:
+        """Pose and way at the begin of every piece: ways and turns add up, then chords along the headings."""
+        moved, turned, _, _ = _moved(self._table, np.diff(self._begin), np.zeros((len(self._table), 3)))
+        yaw = start[2] + np.concatenate(([0.0], np.cumsum(turned)))
+        chord = moved * np.sinc(turned / (2.0 * np.pi))
+        heading = yaw[:-1] + 0.5 * turned
+        self._way[1:] = np.cumsum(moved)
+        self._pose[:, 0] = start[0] + np.concatenate(([0.0], np.cumsum(chord * np.cos(heading))))
+        self._pose[:, 1] = start[1] + np.concatenate(([0.0], np.cumsum(chord * np.sin(heading))))
+        self._pose[:, 2] = yaw
 
     def pose_at(self, time_s: F64) -> F64:
         """See Motion."""
