@@ -21,7 +21,7 @@ from service.relay import Latest, Outbox, Sample, pack
 
 _LOG = logging.getLogger(__name__)
 _PAGE = Path(__file__).parent / "page"
-_LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
+LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -112,7 +112,7 @@ class Relay:
         return len(self._pages)
 
 
-def make_app(relay: Relay, *, hosts: Collection[str] = _LOOPBACK_NAMES) -> web.Application:
+def make_app(relay: Relay, *, hosts: Collection[str] = LOOPBACK_NAMES) -> web.Application:
     """The web application. hosts: names under which it may be asked for, without port."""
 
     @web.middleware
@@ -156,7 +156,7 @@ async def serve(
     *,
     port: int,
     on_ready: Callable[[str], None],
-    hosts: Collection[str] = _LOOPBACK_NAMES,
+    hosts: Collection[str] = LOOPBACK_NAMES,
     stop: asyncio.Event | None = None,
 ) -> None:
     """Serve the page on 127.0.0.1 until stop is set or the task is cancelled.

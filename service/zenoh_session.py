@@ -243,6 +243,11 @@ def subscribe_latched(session: zenoh.Session, key: str, *, ring: int = 64) -> An
     )
 
 
+def subscribe_liveliness(session: zenoh.Session, key: str, *, ring: int = 64) -> Any:
+    """A ring of tokens that come (PUT) and go (DELETE), beginning with those that are there."""
+    return session.liveliness().declare_subscriber(key, handlers.RingChannel(ring), history=True)
+
+
 def declare_queryable(session: zenoh.Session, key: str, on_query: Callable[[Any], None]) -> Any:
     """Answer queries. on_query must only hand the query on (a slow one would stop the whole session)."""
     return session.declare_queryable(key, on_query, complete=True)

@@ -6,7 +6,7 @@ import * as draw from "./draw.js";
 const $ = (id) => document.getElementById(id);
 const TEXT = new TextDecoder();
 const TRAIL_STEP_M = 0.05, TRAIL_POINTS = 6000, POSES_KEPT = 200, EVENTS_KEPT = 12, RING_REACH_M = 3;
-const LEVELS = ["ok", "warning", "error", "stale"];
+const LEVELS = ["ok", "warning", "error", "stale"]; // as health names them
 
 class Robot {
   constructor(base) {
@@ -47,7 +47,7 @@ class Robot {
     return { x: a.x + t * (b.x - a.x), y: a.y + t * (b.y - a.y), yaw: a.yaw + t * turn };
   }
 
-  sensor(name) { return this.info?.sensors?.[name] ?? null; }
+  mount(name) { return this.info?.sensors.find((sensor) => sensor.name === name)?.pose ?? null; }
   get footprint() { return this.info?.footprint_m ?? [[0.2, 0.15], [-0.2, 0.15], [-0.2, -0.15], [0.2, -0.15]]; }
 }
 
@@ -96,6 +96,7 @@ const HANDLERS = [
   [/^info$/, (robot, payload) => { robot.info = json(payload); }],
 ];
 
+// Attachment of grids: epoch and number of the update, two unsigned 64-bit numbers, little endian.
 function json(payload) { return JSON.parse(TEXT.decode(payload)); }
 
 function epochOf(attachment) {
@@ -137,7 +138,9 @@ function takeHealth(robot, health) {
   const before = new Map((robot.health?.sources ?? []).map((source) => [source.name, source]));
   for (const source of health.sources) {
     const old = before.get(source.name);
-    if (old && (old.state !== source.state || old.level !== source.level)) note(source.level, `${source.name}: ${source.text || source.state}`);
+    if (old && (old.state !== source.state || old.level !== source.level)) {
+      note(LEVELS.indexOf(source.level), `${source.name}: ${source.text || source.state}`);
+    }
   }
   robot.health = health;
   robot.healthAt = performance.now();
@@ -176,7 +179,7 @@ function ageClass(age, rate) {
 
 function card(source, extraAge) {
   const box = element("article", "", { className: "card" });
-  box.dataset.level = source.level;
+  box.dataset.level = LEVELS.indexOf(source.level);
   const title = element("h2", source.name);
   title.append(element("small", source.kind));
   box.append(title);
@@ -248,10 +251,12 @@ function drawScale() {
 
 // ---- drawing -----------------------------------------------------------------------------------------------------
 
+function planar(pose) { return { x: pose.x_m, y: pose.y_m, yaw: pose.yaw_rad }; }
+
 function polarForDrawing(name, doc) {
   return {
     name,
-    pose: { x: doc.pose.x_m, y: doc.pose.y_m, yaw: doc.pose.yaw_rad },
+    pose: planar(doc.origin),
     sectors: doc.sectors.map((s) => ({ start: s.start_rad, stop: s.stop_rad, state: s.state, distance: s.distance_m })),
   };
 }
@@ -273,18 +278,17 @@ function drawMap(robot) {
 
 function drawScans(g2, robot) {
   for (const [name, scan] of robot.scans) {
-    const mount = robot.sensor(name)?.base_from_sensor, pose = robot.poseAt(scan.stamp);
-    if (pose && mount) draw.drawScan(g2, camera, scan, draw.compose(pose, { x: mount.x_m, y: mount.y_m, yaw: mount.yaw_rad }));
+    const mount = robot.mount(name), pose = robot.poseAt(scan.stamp);
+    if (pose && mount) draw.drawScan(g2, camera, scan, draw.compose(pose, planar(mount)));
   }
 }
 
 function drawCones(g2, robot) {
   for (const doc of robot.cones.values()) {
-    for (const ping of doc.ranges) {
-      const mount = ping.base_from_transducer;
-      const reach = { echo: ping.range_m, no_return: Infinity, too_close: -Infinity }[ping.status] ?? null;
+    for (const transducer of doc.transducers) {
+      const reach = { echo: transducer.range_m, nothing: Infinity, too_close: -Infinity }[transducer.status] ?? null;
       const cone = { range: reach, min: doc.range_min_m, max: doc.range_max_m, fieldOfView: doc.cone_rad };
-      draw.drawCone(g2, camera, cone, draw.compose(robot.pose, { x: mount.x_m, y: mount.y_m, yaw: mount.yaw_rad }));
+      draw.drawCone(g2, camera, cone, draw.compose(robot.pose, planar(transducer.pose)));
     }
   }
 }
@@ -414,4 +418,4 @@ function connect() {
 setInterval(() => { const robot = robots.get(shown) ?? null; drawHeader(robot); drawPanel(robot); }, 250);
 connect();
 requestAnimationFrame(frame);
-window.umfeld = { robots, camera, LEVELS };
+window.umfeld = { robots, camera }; // for tests and for the curious at the browser's console

@@ -1,0 +1,114 @@
+"""`umfeld view`: the live page, a process of its own and a client of the daemon like any other."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.errors import Trouble
+
+if TYPE_CHECKING:
+    from service.relay import Sample
+    from service.view import Relay
+    from service.zenoh_session import Client
+
+app = typer.Typer()
+
+DEFAULT_PORT = 8765
+_DRAIN = 64
+
+
+@app.command()
+def view(
+    *,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: a free one.")] = DEFAULT_PORT,
+    connect: Annotated[str, typer.Option(help="Where the daemon listens.")] = "tcp/127.0.0.1:7447",
+    base: Annotated[str, typer.Option(help="Key of the robots to show; * stands for any.")] = "robots/*",
+    allow_host: Annotated[
+        list[str] | None, typer.Option(help="Another name for this page, e.g. of a reverse proxy before it.")
+    ] = None,
+) -> None:
+    """The live page: map, robot, scan, sonar cones, sectors, devices. Read-only, on this machine only.
+
+    Example: umfeld view --port 8765, and from a desk: ssh -L 8765:127.0.0.1:8765 robot
+    """
+    from service.zenoh_session import Client
+
+    with Client(connect) as client:
+        try:
+            asyncio.run(_serve(client, base, port, allow_host or []))
+        except OSError as error:
+            raise Trouble(
+                f"the page's port {port} cannot be had ({error.strerror}): choose another with --port"
+            ) from error
+
+
+async def _serve(client: Client, base: str, port: int, allow_host: Sequence[str]) -> None:
+    from service.view import LOOPBACK_NAMES, serve
+
+    stop = asyncio.Event()
+    for name in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(name, stop.set)
+    await serve(
+        lambda relay: _receive(client, base, relay),
+        port=port,
+        on_ready=lambda address: print(address, flush=True),
+        hosts=LOOPBACK_NAMES | {name.lower() for name in allow_host},
+        stop=stop,
+    )
+
+
+def _receive(client: Client, base: str, relay: Relay) -> Callable[[], None]:
+    """Subscribe to everything the robots publish and to their coming and going; returns what ends it."""
+    import zenoh
+
+    from service.topics import ALIVE
+    from service.view import Pump
+    from service.zenoh_session import subscribe_liveliness
+
+    samples = client.subscribe_latched(f"{base}/**", ring=1024)
+    tokens = subscribe_liveliness(client.session, f"{base}/{ALIVE}")
+
+    def take() -> Sequence[Sample] | None:
+        try:
+            first = samples.recv()
+        except zenoh.ZError:
+            return None
+        batch = [_plain(first)]
+        while len(batch) < _DRAIN and (more := samples.try_recv()) is not None:
+            batch.append(_plain(more))
+        return batch
+
+    def watch() -> Sequence[Sample] | None:
+        try:
+            token = tokens.recv()
+        except zenoh.ZError:
+            return None
+        relay.robot_from_thread(str(token.key_expr).removesuffix(f"/{ALIVE}"), str(token.kind) == "SampleKind.PUT")
+        return ()
+
+    pumps = [Pump(take, relay), Pump(watch, relay)]
+    for pump in pumps:
+        pump.start()
+
+    def end() -> None:
+        for subscriber in (samples, tokens):
+            with contextlib.suppress(zenoh.ZError):
+                subscriber.undeclare()
+        for pump in pumps:
+            pump.join(1.0)
+
+    return end
+
+
+def _plain(sample: object) -> Sample:
+    from service.relay import Sample
+    from service.zenoh_session import received
+
+    got = received(sample)  # type: ignore[arg-type]
+    return Sample(got.key, got.payload, got.attachment or b"")
