@@ -1,0 +1,300 @@
+"""Compiled loops of the sector maps (S34 to S40).
+
+What a sensor has seen is a star polygon about the sensor: every beam a thin sector as long as its range, nothing where
+no beam looked. Its corners are given in the frame of the virtual sensor. An area is free only if it holds no border
+of that polygon and lies inside it; the vehicle's own outline needs no looking at.
+Sectors of a polar map: n wedges of `width` from `start`, the last one ends at start + span.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+TWO_PI = 2.0 * math.pi
+EDGE_RAD = 1e-9  # bearings closer to an edge than this lie on it
+MAX_CUTS = 64  # of one segment with the outline of the vehicle
+
+
+@njit(cache=True, nogil=True)
+def sector_of(bearing: float, start: float, width: float, span: float, count: int) -> int:
+    """Index of the sector that holds a bearing, -1 if none does. A lower edge belongs to its sector; so does stop."""
+    along = (bearing - start) % TWO_PI
+    if along > TWO_PI - EDGE_RAD:
+        along = 0.0
+    if along > span + EDGE_RAD:
+        return -1
+    return min(int((along + EDGE_RAD) / width), count - 1)
+
+
+@njit(cache=True, nogil=True)
+def point_in_polygon(x: float, y: float, polygon: Any) -> bool:
+    """Even-odd rule; no polygon holds nothing."""
+    inside = False
+    previous = len(polygon) - 1
+    for corner in range(len(polygon)):
+        ax, ay = polygon[previous, 0], polygon[previous, 1]
+        bx, by = polygon[corner, 0], polygon[corner, 1]
+        if (ay > y) != (by > y) and x < ax + (y - ay) * (bx - ax) / (by - ay):
+            inside = not inside
+        previous = corner
+    return inside
+
+
+@njit(cache=True, nogil=True)
+def inside_polygon(x: Any, y: Any, polygon: Any) -> Any:
+    """Which of many points lie in a polygon."""
+    inside = np.zeros(len(x), dtype=np.bool_)
+    for k in range(len(x)):
+        inside[k] = point_in_polygon(x[k], y[k], polygon)
+    return inside
+
+
+@njit(cache=True, nogil=True)
+def border_distances(bearing: Any, polygon: Any) -> Any:
+    """Where each ray from the origin crosses the polygon for the last time, 0 if never, NaN for a NaN bearing."""
+    result = np.zeros(len(bearing))
+    for k in range(len(bearing)):
+        if math.isnan(bearing[k]):
+            result[k] = math.nan
+            continue
+        ux, uy = math.cos(bearing[k]), math.sin(bearing[k])
+        previous = len(polygon) - 1
+        for corner in range(len(polygon)):
+            ax, ay = polygon[previous, 0], polygon[previous, 1]
+            ex, ey = polygon[corner, 0] - ax, polygon[corner, 1] - ay
+            previous = corner
+            across = ux * ey - uy * ex
+            if across == 0.0:
+                continue
+            along = (ax * ey - ay * ex) / across
+            at = (ax * uy - ay * ux) / across
+            if along > result[k] and -1e-12 <= at <= 1.0 + 1e-12:
+                result[k] = along
+    return result
+
+
+@njit(cache=True, nogil=True)
+def nearest_on(ax: float, ay: float, bx: float, by: float) -> tuple[float, float]:
+    """The point of a segment nearest to the origin."""
+    ex, ey = bx - ax, by - ay
+    square = ex * ex + ey * ey
+    t = 0.0
+    if square > 0.0:
+        t = min(max(-(ax * ex + ay * ey) / square, 0.0), 1.0)
+    return ax + t * ex, ay + t * ey
+
+
+@njit(cache=True, nogil=True)
+def nearest_outside(ax: float, ay: float, bx: float, by: float, polygon: Any, reach: float) -> float:
+    """How near a segment comes to the origin outside the polygon; inf if it stays inside.
+
+    reach: no corner of the polygon is farther from the origin.
+    """
+    nx, ny = nearest_on(ax, ay, bx, by)
+    near = math.hypot(nx, ny)
+    if near > reach or len(polygon) == 0:
+        return near
+    cuts = np.empty(MAX_CUTS)
+    cuts[0] = 0.0
+    count = 1
+    ex, ey = bx - ax, by - ay
+    previous = len(polygon) - 1
+    for corner in range(len(polygon)):
+        px, py = polygon[previous, 0], polygon[previous, 1]
+        fx, fy = polygon[corner, 0] - px, polygon[corner, 1] - py
+        previous = corner
+        across = ex * fy - ey * fx
+        if across == 0.0:
+            continue
+        t = ((px - ax) * fy - (py - ay) * fx) / across
+        u = ((px - ax) * ey - (py - ay) * ex) / across
+        if 0.0 < t < 1.0 and 0.0 <= u <= 1.0:
+            if count == MAX_CUTS - 1:
+                return near  # more than we keep book of: as if all of it were outside
+            cuts[count] = t
+            count += 1
+    cuts[count] = 1.0
+    count += 1
+    order = np.sort(cuts[:count])
+    best = math.inf
+    for k in range(count - 1):
+        lo, hi = order[k], order[k + 1]
+        middle = 0.5 * (lo + hi)
+        if point_in_polygon(ax + middle * ex, ay + middle * ey, polygon):
+            continue
+        nx, ny = nearest_on(ax + lo * ex, ay + lo * ey, ax + hi * ex, ay + hi * ey)
+        best = min(best, math.hypot(nx, ny))
+    return best
+
+
+@njit(cache=True, nogil=True)
+def clip_to_wedge(
+    ax: float, ay: float, bx: float, by: float, lo_x: float, lo_y: float, hi_x: float, hi_y: float
+) -> tuple[float, float]:
+    """The stretch t0 <= t <= t1 of a segment between two rays from the origin, at most half a turn apart.
+
+    t0 > t1: none of it.
+    """
+    t0, t1 = 0.0, 1.0
+    # left of the lower ray, then right of the upper one
+    for side in range(2):
+        if side == 0:
+            at_a, at_b = lo_x * ay - lo_y * ax, lo_x * by - lo_y * bx
+        else:
+            at_a, at_b = hi_y * ax - hi_x * ay, hi_y * bx - hi_x * by
+        if at_a < 0.0 and at_b < 0.0:
+            return 1.0, 0.0
+        if at_a < 0.0:
+            t0 = max(t0, at_a / (at_a - at_b))
+        elif at_b < 0.0:
+            t1 = min(t1, at_a / (at_a - at_b))
+    return t0, t1
+
+
+@njit(cache=True, nogil=True)
+def free_reach(border: Any, edges: Any, width: float, polygon: Any, reach: float, range_max: float) -> Any:
+    """How near the border of a star polygon comes to the origin within each sector, outside the vehicle's outline.
+
+    border: (M, 2) corners of the closed polygon, virtual sensor frame.  Returns (N,), at most range_max.
+    """
+    count = len(edges) - 1
+    start, span = edges[0], edges[-1] - edges[0]
+    free = np.full(count, range_max)
+    edge_x, edge_y = np.cos(edges), np.sin(edges)
+    corners = len(border)
+    if corners == 0:
+        free[:] = 0.0
+        return free
+    bx, by = border[corners - 1, 0], border[corners - 1, 1]
+    b_rad = math.atan2(by, bx)
+    for corner in range(corners):
+        ax, ay, a_rad = bx, by, b_rad
+        bx, by = border[corner, 0], border[corner, 1]
+        if ax == bx and ay == by:
+            continue
+        b_rad = math.atan2(by, bx)
+        nx, ny = nearest_on(ax, ay, bx, by)
+        near = math.hypot(nx, ny)
+        if near >= range_max:
+            continue
+        turn = (b_rad - a_rad + math.pi) % TWO_PI - math.pi
+        lo = (a_rad if turn >= 0.0 else b_rad) - EDGE_RAD
+        along = (lo - start) % TWO_PI
+        sweep = abs(turn) + 2.0 * EDGE_RAD
+        if near < 1e-9:  # the border runs through the origin itself
+            along, sweep = 0.0, TWO_PI
+        for lap in range(2):
+            first = along - lap * TWO_PI
+            last = first + sweep
+            if last < 0.0 or first > span:
+                continue
+            for sector in range(max(0, int(first / width)), min(count - 1, int(last / width)) + 1):
+                if near >= free[sector]:
+                    continue
+                t0, t1 = clip_to_wedge(
+                    ax, ay, bx, by, edge_x[sector], edge_y[sector], edge_x[sector + 1], edge_y[sector + 1]
+                )
+                if t0 > t1:
+                    continue
+                ex, ey = bx - ax, by - ay
+                found = nearest_outside(ax + t0 * ex, ay + t0 * ey, ax + t1 * ex, ay + t1 * ey, polygon, reach)
+                free[sector] = min(free[sector], found)
+    return free
+
+
+@njit(cache=True, nogil=True)
+def free_from_origin(lo: Any, hi: Any, length: Any, edges: Any, width: float, range_max: float) -> Any:
+    """free_reach for a sensor that stands on the virtual origin: the shortest beam of each sector, exact.
+
+    lo, hi, length: (M,) the thin sectors of the beams, ascending, together at most one turn; gaps are not free.
+    """
+    count = len(edges) - 1
+    start, span = edges[0], edges[-1] - edges[0]
+    free = np.full(count, range_max)
+    covered = np.zeros(count)
+    for beam in range(len(lo)):
+        along = (lo[beam] - start) % TWO_PI
+        sweep = hi[beam] - lo[beam]
+        for lap in range(2):
+            first = along - lap * TWO_PI
+            last = first + sweep
+            if last < 0.0 or first > span:
+                continue
+            for sector in range(max(0, int(first / width)), min(count - 1, int(last / width)) + 1):
+                begin, end = edges[sector] - start, edges[sector + 1] - start
+                common = min(last, end) - max(first, begin)
+                if common > EDGE_RAD:
+                    covered[sector] += common
+                    free[sector] = min(free[sector], length[beam])
+    for sector in range(count):
+        if covered[sector] < edges[sector + 1] - edges[sector] - 1e-6:
+            free[sector] = 0.0
+    return free
+
+
+@njit(cache=True, nogil=True)
+def nearest_in_sectors(x: Any, y: Any, edges: Any, width: float, range_max: float) -> tuple[Any, Any]:
+    """Per sector the distance and bearing of the nearest of many points; inf and NaN where there is none."""
+    count = len(edges) - 1
+    start, span = edges[0], edges[-1] - edges[0]
+    best = np.full(count, math.inf)
+    at = np.full(count, math.nan)
+    for k in range(len(x)):
+        distance = math.hypot(x[k], y[k])
+        if not distance <= range_max:
+            continue
+        bearing = math.atan2(y[k], x[k])
+        sector = sector_of(bearing, start, width, span, count)
+        if sector >= 0 and distance < best[sector]:
+            best[sector] = distance
+            at[sector] = bearing
+    return best, at
+
+
+@njit(cache=True, nogil=True)
+def arc_in_sectors(arc: Any, off_axis: Any, edges: Any, width: float, range_max: float) -> tuple[Any, Any]:
+    """Per sector the nearest point of a polyline, and the bearing of the point nearest to the axis.
+
+    arc: (M, 2) corners, virtual sensor frame.  off_axis: (M,) absolute angle of each corner off the sensor's axis.
+    Returns (N,) distances, inf where the line does not pass, and (N,) bearings, NaN there.
+    """
+    count = len(edges) - 1
+    start, span = edges[0], edges[-1] - edges[0]
+    best = np.full(count, math.inf)
+    at = np.full(count, math.nan)
+    least = np.full(count, math.inf)
+    edge_x, edge_y = np.cos(edges), np.sin(edges)
+    for k in range(len(arc) - 1):
+        ax, ay, bx, by = arc[k, 0], arc[k, 1], arc[k + 1, 0], arc[k + 1, 1]
+        a_rad, b_rad = math.atan2(ay, ax), math.atan2(by, bx)
+        turn = (b_rad - a_rad + math.pi) % TWO_PI - math.pi
+        along = ((a_rad if turn >= 0.0 else b_rad) - EDGE_RAD - start) % TWO_PI
+        sweep = abs(turn) + 2.0 * EDGE_RAD
+        for lap in range(2):
+            first = along - lap * TWO_PI
+            last = first + sweep
+            if last < 0.0 or first > span:
+                continue
+            for sector in range(max(0, int(first / width)), min(count - 1, int(last / width)) + 1):
+                t0, t1 = clip_to_wedge(
+                    ax, ay, bx, by, edge_x[sector], edge_y[sector], edge_x[sector + 1], edge_y[sector + 1]
+                )
+                if t0 > t1 or (t1 - t0) * abs(turn) < EDGE_RAD < abs(turn):
+                    continue  # it only touches the edge
+                ex, ey = bx - ax, by - ay
+                nx, ny = nearest_on(ax + t0 * ex, ay + t0 * ey, ax + t1 * ex, ay + t1 * ey)
+                distance = math.hypot(nx, ny)
+                if distance > range_max:
+                    continue
+                best[sector] = min(best[sector], distance)
+                at_t0 = off_axis[k] + t0 * (off_axis[k + 1] - off_axis[k])
+                at_t1 = off_axis[k] + t1 * (off_axis[k + 1] - off_axis[k])
+                t = t0 if at_t0 <= at_t1 else t1
+                if min(at_t0, at_t1) < least[sector]:
+                    least[sector] = min(at_t0, at_t1)
+                    at[sector] = math.atan2(ay + t * ey, ax + t * ex)
+    return best, at
