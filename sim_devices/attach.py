@@ -18,6 +18,7 @@ import queue
 import select
 import socket
 import struct
+import termios
 import threading
 import time
 import tty
@@ -84,6 +85,7 @@ class PtyLink:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self.counters = LinkCounters()
+        self._name = self.path.name
         self._master: int | None = None
         self._slave: int | None = None
         self.open()
@@ -119,6 +121,21 @@ class PtyLink:
         fresh.unlink(missing_ok=True)
         fresh.symlink_to(os.ttyname(self._slave))
         fresh.replace(self.path)
+
+    def rename(self, suffix: str) -> None:
+        """Come back under another name: the first one with a suffix; none for the first one. Unplugs if it changes."""
+        path = self.path.with_name(self._name + suffix)
+        if path != self.path:
+            self.close()
+            self.path = path
+
+    def obstruct(self, *, busy: bool, denied: bool) -> None:
+        """Let programs that ask for the port find it held by another (busy) or not permitted (root still may)."""
+        if self._slave is None:
+            return
+        fcntl.flock(self._slave, fcntl.LOCK_EX | fcntl.LOCK_NB if busy else fcntl.LOCK_UN)
+        fcntl.ioctl(self._slave, termios.TIOCEXCL if busy else termios.TIOCNXCL)
+        os.chmod(os.ttyname(self._slave), 0o000 if denied else 0o620)
 
     def close(self) -> None:
         if self._master is None or self._slave is None:
@@ -316,8 +333,9 @@ class Station(Protocol):
 class DeviceStation:
     """One serial or TCP device on its link.
 
-    A device with an attribute `plugged` (a fault wrapper) pulls its own wire by setting it False; one with `next_ns` is
-    served when it asks for it; one with `link_lost(now_ns)` is told when its TCP host went away.
+    A device with an attribute `plugged` (a fault wrapper) pulls its own wire by setting it False, with `port_suffix` it
+    renames its pty, with `port_busy` and `port_denied` it keeps others out; one with `next_ns` is served when it asks
+    for it; one with `link_lost(now_ns)` is told when its TCP host went away.
     """
 
     def __init__(self, device: ByteDevice, link: Link) -> None:
@@ -325,6 +343,7 @@ class DeviceStation:
         self.link = link
         self._wanted = True
         self._hosts_lost = 0
+        self._obstructed = (False, False)
 
     def files(self) -> list[int]:
         return self.link.files()
@@ -348,10 +367,21 @@ class DeviceStation:
 
     def _follow_plug(self) -> None:
         wanted = self._wanted and bool(getattr(self.device, "plugged", True))
+        if isinstance(self.link, PtyLink):
+            self.link.rename(str(getattr(self.device, "port_suffix", "")))
         if wanted and not self.link.is_open:
             self.link.open()
+            self._obstructed = (False, False)
         elif not wanted and self.link.is_open:
             self.link.close()
+        self._follow_obstruction()
+
+    def _follow_obstruction(self) -> None:
+        state = bool(getattr(self.device, "port_busy", False)), bool(getattr(self.device, "port_denied", False))
+        if state != self._obstructed and isinstance(self.link, PtyLink) and self.link.is_open:
+            with contextlib.suppress(BlockingIOError):  # a host holds it: try again at the next service
+                self.link.obstruct(busy=state[0], denied=state[1])
+                self._obstructed = state
 
     def _tell_loss(self, now_ns: int) -> None:
         lost = int(getattr(self.link, "hosts_lost", 0))

@@ -299,6 +299,7 @@ class HokuyoLaser:
         self._clock_start_ms = clock_start_ms
         self._spin_up_ns = round(spin_up_s * SECOND_NS)
         self._trouble: str | None = None
+        self._speed_share = 1.0
         self._handlers: dict[bytes, Callable[[bytes, bytes, int], None]] = {
             b"VV": self._version,
             b"PP": self._parameters,
@@ -374,7 +375,7 @@ class HokuyoLaser:
         self._clock_offset_ms = self._clock_start_ms
         self._scip1 = self._start_in_scip1
         self._slower_percent = 0
-        self._period_ns = self.profile.period_ns
+        self._period_ns = round(self.profile.period_ns / self._speed_share)
         self._turn_zero_ns = self._boot_done_ns + self._spin_up_ns
         self._wire = PacedWire(self._base_rate_bps, now_ns)
         self._buffer = bytearray()
@@ -386,6 +387,17 @@ class HokuyoLaser:
         self._sensitive = False
         self._reboot_asked_ns: int | None = None
         self._last_command = b""
+
+    def set_clock_drift(self, ppm: float, now_ns: int) -> None:
+        """Let the clock run so much too fast from now on; it does not jump."""
+        elapsed_ns = (now_ns - self._clock_zero_ns) * (1.0 + self.clock_drift_ppm * 1e-6)
+        self.clock_drift_ppm = ppm
+        self._clock_zero_ns = now_ns - round(elapsed_ns / (1.0 + ppm * 1e-6))
+
+    def set_speed_share(self, share: float, now_ns: int) -> None:
+        """Let the head turn at this share of the speed it should have."""
+        self._speed_share = share
+        self._turn_at(self._slower_percent, now_ns)
 
     def link_lost(self, now_ns: int) -> None:
         """The host's TCP connection ended: stop measuring and forget what was to be sent."""
@@ -693,10 +705,12 @@ class HokuyoLaser:
 
     def _set_speed(self, slower_percent: int, now_ns: int) -> None:
         """Turn the head slower by so many percent; the turn under way begins anew."""
-        if slower_percent == self._slower_percent:
-            return
+        if slower_percent != self._slower_percent:
+            self._turn_at(slower_percent, now_ns)
+
+    def _turn_at(self, slower_percent: int, now_ns: int) -> None:
         self._slower_percent = slower_percent
-        self._period_ns = round(self.profile.period_ns * 100 / (100 - slower_percent))
+        self._period_ns = round(self.profile.period_ns * 100 / (100 - slower_percent) / self._speed_share)
         self._turn_zero_ns = max(self._turn_zero_ns, now_ns)
         self._first_turn = 0
         if self._stream is not None:

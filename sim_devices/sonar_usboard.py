@@ -65,7 +65,8 @@ class UsBoard:
     range_min_m, range_max_m: what it can measure.  noise_m: standard deviation of a distance.
     air_temp_c: true air temperature; the board reckons with the speed of sound at 20 degrees.
     analog: four 12-bit levels of its inputs.  eeprom_s: time that storing one part takes.
-    Cross-talk: `hears` lists boards whose pulses this one takes for its own echoes.
+    Faults: `hears` lists boards whose pulses this one takes for its own echoes; `stuck_m` gives channels that always
+    read the same.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class UsBoard:
         self.analog = list(analog)
         self.eeprom_s = eeprom_s
         self.hears: list[UsBoard] = []
+        self.stuck_m: dict[int, float] = {}
         self._boot_ns = round(boot_s * SECOND_NS)
         self._random = np.random.default_rng(seed)
         self.power_on(0)
@@ -250,6 +252,8 @@ class UsBoard:
         transducer = self.transducers.get(channel)
         if transducer is None or not self._active >> channel - 1 & 1:
             return None
+        if channel in self.stuck_m:
+            return self.stuck_m[channel]
         firing = self._last_firing(channel, now_ns)
         done, value = self._smoothed.get(channel, (-1, inf))
         gain = self.parameters[47] / 128
