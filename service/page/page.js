@@ -96,12 +96,12 @@ const HANDLERS = [
   [/^info$/, (robot, payload) => { robot.info = json(payload); }],
 ];
 
-// Attachment of grids: epoch and number of the update, two unsigned 64-bit numbers, little endian.
 function json(payload) { return JSON.parse(TEXT.decode(payload)); }
 
+// Attachment of grids: epoch and number of the update, two unsigned 64-bit numbers, little endian.
 function epochOf(attachment) {
   if (attachment.length < 8) return null;
-  return new DataView(attachment.buffer, attachment.byteOffset).getBigInt64(0, true);
+  return new DataView(attachment.buffer, attachment.byteOffset).getBigUint64(0, true);
 }
 
 function take({ key, attachment, payload }) {
