@@ -48,6 +48,7 @@ _HEADER = re.compile(
     rb"(?P<echo>(?:[GM][DSE]\d{10}(?:\d{3})?|VV|PP|II|BM|QT|RS|RB|TM\d|SS\d{6}|CR\d\d|HS\d|%ST|SCIP2\.0|(?:(?<=\n)|\A)V)"
     rb"(?:;[0-9A-Za-z ._+@-]{0,16})?)\n(?P<status>[0-9A-Z]{2}[0-o]|[0E])\n"
 )
+_ECHO_MAX = 32  # 15 characters, `;`, 16 more
 _SCAN_ECHO = re.compile(rb"([GM][DSE])(\d{4})(\d{4})(\d{2})(?:(\d)(\d{2}))?(?:;.*)?")
 _KEYED = (b"VV", b"PP", b"II", b"%S")  # text lines of the form KEY:value;
 
@@ -249,11 +250,10 @@ class ScipReplies:
             except FrameError as error:
                 reason = error.reason
         # What is damaged may have lost its end, and the whole reply behind it is then in the same block.
-        headers = list(_HEADER.finditer(block, 1))
-        if not headers:
+        last = _last_header(block)
+        if last is None or last.start() == 0:
             self.counters.drop(reason)
             return []
-        last = headers[-1]
         replies = []
         if header is not None and header["echo"] == b"V":  # a real URG-04LX ends this reply without an empty line
             with contextlib.suppress(FrameError):
@@ -361,6 +361,19 @@ def _near_ranges(codes: CodeTable, range_min_mm: int, near_mm: int) -> F64:
     return table
 
 
+def _last_header(block: bytes) -> re.Match[bytes] | None:
+    """The last echo and status in a block: from its end, line by line, at the lines that are as short as a status."""
+    line_end = len(block) - 1
+    while (line_start := block.rfind(b"\n", 0, line_end) + 1) > 0:
+        if line_end - line_start in (1, 3):
+            echo_line = block.rfind(b"\n", 0, line_start - 1) + 1
+            header = _HEADER.search(block, max(echo_line, line_start - 1 - _ECHO_MAX), line_end + 1)
+            if header is not None:
+                return header
+        line_end = line_start - 1
+    return None
+
+
 def _read_reply(block: bytes, header: re.Match[bytes], began_ns: int, arrived_ns: int, bytes_after: int) -> Reply:
     """The reply that begins at `header` and fills the rest of the block. FrameError names what is wrong."""
     echo, status = header["echo"], header["status"]
@@ -392,7 +405,9 @@ def _lines_of_scip1(echo: bytes, status: bytes, body: bytes) -> tuple[bytes, ...
     lines = tuple(body.split(b"\n")[:-1])
     if status == b"E" and not lines:
         return lines
-    if status == b"0" and (all(b":" in line for line in lines) if echo == b"V" else echo == b"SCIP2.0" and not lines):
+    if status == b"0" and echo == b"V" and lines and all(b":" in line for line in lines):
+        return lines
+    if status == b"0" and echo == b"SCIP2.0" and not lines:
         return lines
     raise FrameError("bad_status", "neither SCIP 1.1 nor 2")
 

@@ -29,7 +29,8 @@ PP_URG = (
 )
 II_URG = (
     b"II\n00P\nMODL:URG-04LX(Hokuyo Automatic Co.,Ltd.);N\nLASR:OFF;7\n"
-    b"SCSP:Initial(600[rpm])<-Default setting by user;A\nMESM:IDLE;:\nSBPS:19200[bps]<-Default setting by user;A\nTIME:001957;O\nSTAT:Sensor works well.;8\n\n"
+    b"SCSP:Initial(600[rpm])<-Default setting by user;A\nMESM:IDLE;:\nSBPS:19200[bps]<-Default setting by user;A\n"
+    b"TIME:001957;O\nSTAT:Sensor works well.;8\n\n"
 )
 
 
