@@ -183,6 +183,8 @@ def encode_parameters(parameters: UsBoardParameters) -> bytes:
         raise ValueError(f"base_id {parameters.base_id:X}h or serial_number {parameters.serial_number} out of range")
     if not 0 <= parameters.active <= 0xFFFF or not 0 <= parameters.send_groups <= 0xF:
         raise ValueError("active has 16 bits, send_groups 4")
+    if len(parameters.warning_cm) != 16 or len(parameters.alarm_cm) != 16:
+        raise ValueError("warning_cm and alarm_cm need 16 values each")
     block = bytearray(PARAMETER_SIZE)
     block[0] = _CAN_RATES_BPS.index(parameters.can_rate_bps)
     block[1:5] = parameters.base_id.to_bytes(4, "little")
@@ -200,8 +202,6 @@ def encode_parameters(parameters: UsBoardParameters) -> bytes:
     block[47] = round(parameters.low_pass_gain * 128)
     block[49] = parameters.hardware_version
     block[50:54] = parameters.serial_number.to_bytes(4, "little")
-    if len(block) != PARAMETER_SIZE:
-        raise ValueError("warning_cm and alarm_cm need 16 values each")
     return bytes(block)
 
 
