@@ -132,20 +132,20 @@ def _moved(table: F64, since_s: F64, pose: F64) -> tuple[F64, F64, F64, F64]:
 
 @dataclass(slots=True)
 class CommandedMotion:
-    """A motion that drive commands make while it lasts: each holds until the next, for half a second at most.
+    """A motion that drive commands make while it lasts: each holds until the next, or until its own time is over.
 
     Commands come in order of time; what lies before the newest is fixed.
     """
 
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    _commands: list[tuple[float, float, float]] = field(default_factory=list)
+    _commands: list[tuple[float, float, float, float]] = field(default_factory=list)
     _built: Trajectory | None = None
 
-    def command(self, time_s: float, forward_m_s: float, turn_rad_s: float) -> None:
+    def command(self, time_s: float, forward_m_s: float, turn_rad_s: float, *, hold_s: float = COMMAND_HOLDS_S) -> None:
         """Drive so from this time on. Raises ValueError if it is before the command before."""
         if self._commands and time_s < self._commands[-1][0]:
             raise ValueError("drive commands must come in order of time")
-        self._commands.append((max(0.0, time_s), forward_m_s, turn_rad_s))
+        self._commands.append((max(0.0, time_s), forward_m_s, turn_rad_s, hold_s))
         self._built = None
 
     def pose_at(self, time_s: F64) -> F64:
@@ -160,8 +160,8 @@ class CommandedMotion:
         if self._built is None:
             pieces, now = [], 0.0
             ends = [c[0] for c in self._commands[1:]] + [math.inf]
-            for (begin, forward, turn), end in zip(self._commands, ends):
-                held = min(end - begin, COMMAND_HOLDS_S)
+            for (begin, forward, turn, hold), end in zip(self._commands, ends):
+                held = min(end - begin, hold)
                 pieces += [Piece(begin - now), twist(forward, turn, held)]
                 now = begin + held
             self._built = Trajectory(self.start, pieces)
@@ -343,7 +343,8 @@ class SimScene:
     """The truth that emulated devices measure: a robot on its motion through a world (a `device.Scene`).
 
     origin_ns: the moment at which the world's time is 0.  People walk from then on; the robot drives once
-    `begin_motion` was called (at once if begin_at_origin).
+    `begin_motion` was called (at once if begin_at_origin).  speed: seconds of the world's time for each of the devices'
+    time: robot and people hurry, the devices keep their pace.
     """
 
     def __init__(
@@ -355,8 +356,10 @@ class SimScene:
         errors: WheelErrors | None = None,
         origin_ns: int = 0,
         begin_at_origin: bool = True,
+        speed: float = 1.0,
     ) -> None:
         self.world = world
+        self.speed = speed
         self.motion = motion
         self.origin_ns = origin_ns
         self.motion_ns: int | None = origin_ns if begin_at_origin else None
@@ -369,7 +372,7 @@ class SimScene:
 
     def pose_at(self, stamp_ns: ArrayLike) -> F64:
         """True poses (N, 3) of the robot's base in the world at times (N,) in nanoseconds; yaw not wrapped."""
-        return self.motion.pose_at(self._motion_s(np.asarray(stamp_ns, dtype=np.float64)))
+        return self.motion.pose_at(self.motion_s(np.asarray(stamp_ns, dtype=np.float64)))
 
     def beam_ranges(self, mount: Mount, bearing_rad: F64, stamp_ns: F64, range_max_m: float) -> F64:
         """See `device.Scene`: each beam from where the robot is when it is fired."""
@@ -377,7 +380,7 @@ class SimScene:
         pose = self.pose_at(stamps)
         origin = _mounted(pose, mount)
         heading = pose[:, 2] + mount.yaw_rad + np.asarray(bearing_rad, dtype=np.float64)
-        world_s = (stamps - self.origin_ns) * 1e-9
+        world_s = (stamps - self.origin_ns) * (1e-9 * self.speed)
         return self.world.beam_distances(origin, heading, world_s, z_m=mount.z_m, range_max_m=range_max_m)
 
     def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
@@ -386,18 +389,19 @@ class SimScene:
         x, y = _mounted(pose, mount)[0]
         here: Point = (float(x), float(y))
         heading = float(pose[0, 2]) + mount.yaw_rad
-        world_s = (now_ns - self.origin_ns) * 1e-9
+        world_s = (now_ns - self.origin_ns) * (1e-9 * self.speed)
         return self.world.cone_distance(here, heading, half_angle_rad, world_s, z_m=mount.z_m, range_max_m=range_max_m)
 
     def wheel_travel_m(self, now_ns: int) -> tuple[float, float]:
         """See `device.Scene`."""
-        left, right = self._wheels.travel_at(self._motion_s(np.array([float(now_ns)])))[0]
+        left, right = self._wheels.travel_at(self.motion_s(np.array([float(now_ns)])))[0]
         return float(left), float(right)
 
-    def _motion_s(self, stamp_ns: F64) -> F64:
+    def motion_s(self, stamp_ns: F64) -> F64:
+        """Time on the motion (N,) at moments (N,)."""
         if self.motion_ns is None:
             return np.zeros_like(stamp_ns)
-        return (stamp_ns - self.motion_ns) * 1e-9
+        return (stamp_ns - self.motion_ns) * (1e-9 * self.speed)
 
 
 def _mounted(pose: F64, mount: Mount) -> F64:
