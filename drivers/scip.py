@@ -311,8 +311,8 @@ def parse_profile(fields: Mapping[str, str]) -> Profile:
 
 
 def model_name(text: str) -> str:
-    """`URG-04LX(Hokuyo Automatic Co.,Ltd.)` -> `URG-04LX`."""
-    return text.partition("(")[0].strip()
+    """`URG-04LX(Hokuyo Automatic Co.,Ltd.)` -> `URG-04LX`; some units bracket their maker."""
+    return re.split(r"[(\[]", text, maxsplit=1)[0].strip()
 
 
 # Beyond the range limit devices say the limit, a little more, or one of these; other numbers hint at damage.

@@ -158,8 +158,8 @@ def false_accepts(damage: Damage, cases: int, *, whole_frames: bool = False) -> 
         seen = accepted(damaged + follower, original[:15], FOLLOWER.command())
         assert seen, (damage.__name__, case)
         assert seen[-1] == behind, (damage.__name__, case)
-        assert len(seen) <= 2
-        false += len(seen) == 2 and seen[0] not in accepted(original, original[:15])
+        # A scan that is there twice, whole, passes twice here; the conversation refuses its second stamp.
+        false += any(scan not in accepted(original, original[:15]) for scan in seen[:-1])
     return false
 
 

@@ -186,6 +186,7 @@ def test_code_tables(model: str, table: CodeTable) -> None:
 
 def test_model_name() -> None:
     assert model_name("UTM-30LX(Hokuyo Automatic Co.,Ltd.)") == "UTM-30LX"
+    assert model_name("UTM-30LX[Hokuyo Automatic Co., Ltd.]") == "UTM-30LX"
     assert model_name("UST-10LX") == "UST-10LX"
 
 
