@@ -45,6 +45,7 @@ LINE_RATES = (19200, 38400, 57600, 115200, 250000, 500000, 750000)
 USB_RATE_BPS = 8_000_000  # full-speed CDC moves about 0.8 MB/s
 TCP_RATE_BPS = 100_000_000
 BLOCK = 64
+ALWAYS_OBEYED = frozenset((b"TM", b"QT", b"RS", b"RT", b"%ST"))  # in time mode, too
 REBOOT_WINDOW_NS = SECOND_NS
 MAX_RANGE_2_CHARS = 4095
 
@@ -318,6 +319,8 @@ class HokuyoLaser:
             b"GD": self._latest_scan,
             b"GS": self._latest_scan,
         }
+        if profile.link != "rs232":
+            self._handlers[b"RT"] = self._partial_reset
         if profile.has_intensity:
             self._handlers[b"ME"] = self._stream_scans
             self._handlers[b"GE"] = self._latest_scan
@@ -447,7 +450,7 @@ class HokuyoLaser:
             self._answer(line, "0G", now_ns)
         elif not FREE_STRING.issuperset(free):
             self._answer(line, "0H", now_ns)
-        elif handler is None or (self._time_mode and symbol not in (b"TM", b"QT", b"RS")):
+        elif handler is None or (self._time_mode and symbol not in ALWAYS_OBEYED):
             self._answer(line, "0E", now_ns)
         elif hasty:
             self._answer(line, "0B", now_ns)
@@ -513,7 +516,19 @@ class HokuyoLaser:
 
     def _short_state(self, command: bytes, free: bytes, now_ns: int) -> None:
         if self._sized(command, free, 3, now_ns):
-            self._answer(command + free, "00", now_ns, sealed(self._health(now_ns).encode("ascii")))
+            self._answer(command + free, "00", now_ns, sealed(self._state_code(now_ns)))
+
+    def _state_code(self, now_ns: int) -> bytes:
+        """Three digits: 000 standby, 001 booting, 002 time mode, 003 laser on, 004 streaming, 900 error."""
+        if self._trouble is not None:
+            return b"900"
+        if self._time_mode:
+            return b"002"
+        if self._stream is not None:
+            return b"004"
+        if self.laser_is_on:
+            return b"003"
+        return b"001" if now_ns < self._turn_zero_ns else b"000"
 
     def _health(self, now_ns: int) -> str:
         if self._trouble is not None:
@@ -537,16 +552,24 @@ class HokuyoLaser:
             self._answer(command + free, "00", now_ns)
 
     def _reset(self, command: bytes, free: bytes, now_ns: int) -> None:
-        if not self._sized(command, free, 2, now_ns):
-            return
+        if self._sized(command, free, 2, now_ns):
+            self._forget(now_ns)
+            self._set_speed(0, now_ns)
+            back_bps = self._base_rate_bps if self.link == "rs232" else None
+            self._wire.send(command + free + b"\n" + sealed(b"00") + b"\n", now_ns, back_bps)
+
+    def _partial_reset(self, command: bytes, free: bytes, now_ns: int) -> None:
+        """RT of the younger models: like RS, but motor speed and bit rate stay."""
+        if self._sized(command, free, 2, now_ns):
+            self._forget(now_ns)
+            self._answer(command + free, "00", now_ns)
+
+    def _forget(self, now_ns: int) -> None:
         self._stop()
         self._time_mode = False
         self._sensitive = False
-        self._set_speed(0, now_ns)
         self._clock_zero_ns = now_ns
         self._clock_offset_ms = 0
-        back_bps = self._base_rate_bps if self.link == "rs232" else None
-        self._wire.send(command + free + b"\n" + sealed(b"00") + b"\n", now_ns, back_bps)
 
     def _time(self, command: bytes, free: bytes, now_ns: int) -> None:
         echo = command + free
