@@ -367,8 +367,12 @@ class HokuyoLaser:
 
     def clock_ms(self, now_ns: int) -> int:
         """The device's own clock, 24 bits."""
-        elapsed_ns = (now_ns - self._clock_zero_ns) * (1.0 + self.clock_drift_ppm * 1e-6)
-        return (int(elapsed_ns // 1_000_000) + self._clock_offset_ms) & CLOCK_MASK
+        return (self._clock_ns(now_ns) // 1_000_000 + self._clock_offset_ms) & CLOCK_MASK
+
+    def _clock_ns(self, now_ns: int) -> int:
+        """What the clock has counted since it was set."""
+        elapsed_ns = now_ns - self._clock_zero_ns
+        return elapsed_ns + round(elapsed_ns * self.clock_drift_ppm * 1e-6)
 
     def power_on(self, now_ns: int, boot_s: float = 0.0) -> None:
         """Start from scratch, as after the supply came back; deaf and mute for boot_s."""
@@ -393,9 +397,9 @@ class HokuyoLaser:
 
     def set_clock_drift(self, ppm: float, now_ns: int) -> None:
         """Let the clock run so much too fast from now on; it does not jump."""
-        elapsed_ns = (now_ns - self._clock_zero_ns) * (1.0 + self.clock_drift_ppm * 1e-6)
+        shown_ns = self._clock_ns(now_ns)
         self.clock_drift_ppm = ppm
-        self._clock_zero_ns = now_ns - round(elapsed_ns / (1.0 + ppm * 1e-6))
+        self._clock_zero_ns = now_ns - round(shown_ns / (1.0 + ppm * 1e-6))
 
     def set_speed_share(self, share: float, now_ns: int) -> None:
         """Let the head turn at this share of the speed it should have."""
