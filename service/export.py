@@ -56,14 +56,13 @@ def image_of(patch: GridPatch) -> MapImage:
 def patch_of(image: MapImage, resolution_m: float | None = None) -> GridPatch:
     """A map image on our own lattice of cells (borders at whole multiples of the resolution, axes along the map's).
 
-    Where the lattices differ, each of our cells takes the image cell under its centre, and every occupied image cell
-    also marks the cell its centre lies in: turning a map loses no thin wall. Outside the image all is unknown.
+    An unturned image of the same resolution is moved to the nearest cell border, by half a cell at most, and keeps its
+    shape. Otherwise each of our cells takes the image cell under its centre, and every occupied image cell also marks
+    the cell its centre lies in: turning a map loses no thin wall. Outside the image all is unknown.
     """
     r = image.resolution_m if resolution_m is None else resolution_m
-    shift = (image.origin.x_m / r, image.origin.y_m / r)
-    aligned = image.origin.yaw_rad == 0.0 and r == image.resolution_m
-    if aligned and all(abs(value - round(value)) < 1e-3 for value in shift):
-        return GridPatch(r, round(shift[1]), round(shift[0]), image.cells)
+    if image.origin.yaw_rad == 0.0 and r == image.resolution_m:
+        return GridPatch(r, round(image.origin.y_m / r), round(image.origin.x_m / r), image.cells)
     rows, columns = image.cells.shape
     size = image.resolution_m
     corners = image.origin.apply(np.array([(0, 0), (columns, 0), (0, rows), (columns, rows)]) * size) / r

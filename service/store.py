@@ -8,6 +8,7 @@ meanwhile. On opening the file is checked; a broken one is set aside, never dele
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import json
@@ -16,6 +17,7 @@ import os
 import sqlite3
 import struct
 import threading
+import time
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -125,8 +127,11 @@ class MapStore:
         self.close()
 
     def close(self) -> None:
-        """Fold the write-ahead log into the file and let go of it."""
+        """Fold the write-ahead log into the file, so that it is one file again, and let go of it."""
         with self._mutex:
+            if self._lock_descriptor is not None:
+                with contextlib.suppress(sqlite3.Error):  # a reader has it open: the log stays beside it, as good
+                    self._db.execute("PRAGMA journal_mode = DELETE")
             self._db.close()
             if self._lock_descriptor is not None:
                 os.close(self._lock_descriptor)
@@ -590,3 +595,21 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except sqlite3.Error as error:
         raise StoreTrouble(f"{path}: cannot be read: {error}; load a generation ({path.name}.1)") from error
+
+
+def write_occupancy_map(patch: GridPatch, path: Path, *, source: str, tile_cells: int = 128) -> Receipt:
+    """A new map file with nothing but a grid, for instance one that another program made; replaces path whole."""
+    with replacing(path) as temporary:
+        temporary.unlink()
+        try:
+            with MapStore.open(temporary, wall_ns=time.time_ns) as store:
+                store.snapshot(
+                    {OCCUPANCY: occupancy_tiles(patch, tile_cells)},
+                    {
+                        OCCUPANCY: {"resolution_m": patch.resolution_m, "tile_cells": tile_cells},
+                        "imported_from": source,
+                    },
+                )
+        finally:
+            temporary.with_name(temporary.name + ".lock").unlink(missing_ok=True)
+    return receipt_of(path)

@@ -1,0 +1,276 @@
+"""`umfeld map`: maps of a running daemon, or of a map file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.errors import Trouble, WrongUsage
+
+if TYPE_CHECKING:
+    from service.export import MapImage
+    from service.zenoh_session import Client
+
+app = typer.Typer()
+
+Connect = Annotated[str | None, typer.Option(help="The daemon's endpoint; default: that of the configuration.")]
+Config = Annotated[Path | None, typer.Option("--config", "-c", help="The daemon's configuration file.")]
+Robot = Annotated[str | None, typer.Option(help="The robot's id, where several answer.")]
+AsJson = Annotated[bool, typer.Option("--json", help="As JSON.")]
+Store = Annotated[Path | None, typer.Option(help="A map file instead of a running daemon.")]
+
+
+@app.command()
+def save(
+    name: Annotated[str, typer.Argument(help="One word; with --store, a new map file.")],
+    *,
+    store: Store = None,
+    connect: Connect = None,
+    config: Config = None,
+    robot: Robot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Save the live map under a name, in the daemon's folder of maps; or copy a map file.
+
+    Example: umfeld map save kitchen
+    """
+    if store is not None:
+        with _open(store) as opened:
+            receipt = opened.save_as(Path(name) if "." in name else Path(f"{name}.umfeld")).document()
+    else:
+        with _client(connect, config) as client:
+            receipt = client.call(_base(client, robot), "save_map", {"name": name}, timeout_s=60.0)
+    _report(receipt, as_json)
+
+
+@app.command()
+def load(
+    name: Annotated[str, typer.Argument(help="A name from `umfeld map list`.")],
+    *,
+    connect: Connect = None,
+    config: Config = None,
+    robot: Robot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Replace the live map of a running daemon by a saved one.
+
+    Example: umfeld map load kitchen
+    """
+    with _client(connect, config) as client:
+        answer = client.call(_base(client, robot), "load_map", {"name": name}, timeout_s=60.0)
+    _report(answer, as_json)
+
+
+@app.command("list")
+def list_saved(
+    *,
+    folder: Annotated[Path | None, typer.Option(help="Look in a folder instead of asking the daemon.")] = None,
+    connect: Connect = None,
+    config: Config = None,
+    robot: Robot = None,
+    as_json: AsJson = False,
+) -> None:
+    """The saved maps.
+
+    Example: umfeld map list --folder ~/maps
+    """
+    if folder is not None:
+        from service.store import list_maps
+
+        if not folder.is_dir():
+            raise WrongUsage(f"{folder}: is not a folder")
+        answer: Mapping[str, Any] = {"maps": list_maps(folder)}
+    else:
+        with _client(connect, config) as client:
+            answer = client.call(_base(client, robot), "list_maps")
+    if as_json:
+        typer.echo(json.dumps(answer, indent=2))
+        return
+    if not answer["maps"]:
+        typer.echo("no saved maps; `umfeld map save NAME` makes one")
+    for entry in answer["maps"]:
+        note = entry.get("trouble") or _saved_at(entry.get("saved_ns"))
+        typer.echo(f"{entry['name']:<24} {entry['bytes'] / 1e6:8.2f} MB  {note}")
+
+
+@app.command()
+def info(
+    file: Annotated[Path | None, typer.Argument(help="A .umfeld or .yaml file; without one, the live map.")] = None,
+    *,
+    connect: Connect = None,
+    config: Config = None,
+    robot: Robot = None,
+    as_json: AsJson = False,
+) -> None:
+    """About a map: size, cells, who wrote it.
+
+    Example: umfeld map info kitchen.umfeld --json
+    """
+    if file is None:
+        with _client(connect, config) as client:
+            _report(client.call(_base(client, robot), "map_info"), as_json)
+        return
+    document: dict[str, Any] = {}
+    if _is_store(file):
+        from service.store import check_file
+
+        with _open(file) as opened:
+            document = opened.info()
+        document["check"] = check_file(file) or "ok"
+        if "occupancy" in document["layers"]:
+            document["grid"] = _grid_info(_image(file))
+    else:
+        document = {"path": str(file), "check": "ok", "grid": _grid_info(_image(file))}
+    _report(document, as_json)
+    if document["check"] != "ok":
+        raise typer.Exit(1)
+
+
+@app.command()
+def export(
+    out: Annotated[Path, typer.Argument(help="Where to; the ending says what: .yaml (with .pgm), .png, .npy, .json.")],
+    *,
+    store: Store = None,
+    connect: Connect = None,
+    config: Config = None,
+    robot: Robot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the grid as a file other programs read. PGM and YAML are the ROS map server's.
+
+    Example: umfeld map export kitchen.yaml --store kitchen.umfeld
+    """
+    from service.export import save_grid
+
+    if store is not None:
+        image = _image(store)
+    else:
+        with _client(connect, config) as client:
+            image = _live_image(client, _base(client, robot))
+    receipts = [receipt.document() for receipt in save_grid(image, out)]
+    if as_json:
+        typer.echo(json.dumps({"files": receipts}, indent=2))
+        return
+    for receipt in receipts:
+        typer.echo(_receipt_line(receipt))
+
+
+@app.command("import")
+def import_map(
+    source: Annotated[Path, typer.Argument(help="A map server's .yaml, beside its picture.")],
+    out: Annotated[Path, typer.Argument(help="The map file to make, NAME.umfeld.")],
+    *,
+    resolution: Annotated[float | None, typer.Option(help="Cells of this many metres; default: the picture's.")] = None,
+    force: Annotated[bool, typer.Option(help="Replace the file if it is there.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a map file from a grid of another program; turned origins and any size are fine.
+
+    Example: umfeld map import floor1.yaml floor1.umfeld
+    """
+    from service.export import load_pgm_yaml, patch_of
+    from service.store import write_occupancy_map
+
+    if out.suffix != ".umfeld":
+        raise WrongUsage(f"{out}: a map file ends with .umfeld")
+    if out.exists() and not force:
+        raise WrongUsage(f"{out}: is there already; choose another name, or replace it with --force")
+    if resolution is not None and not 0.001 <= resolution <= 10.0:
+        raise WrongUsage(f"--resolution {resolution}: metres a cell, from 0.001 to 10")
+    patch = patch_of(load_pgm_yaml(source), resolution)
+    receipt = write_occupancy_map(patch, out, source=str(source.name))
+    _report(receipt.document(), as_json)
+
+
+def _client(connect: str | None, config: Path | None) -> Client:
+    from service.config_files import daemon_endpoint, find_config
+    from service.zenoh_session import Client
+
+    return Client(connect or daemon_endpoint(find_config(config)))
+
+
+def _base(client: Client, robot: str | None) -> str:
+    return client.only_base(None if robot is None else f"robots/{robot}")
+
+
+def _open(path: Path) -> Any:
+    from service.store import MapStore
+
+    return MapStore.open(path, wall_ns=lambda: 0, read_only=True)
+
+
+def _is_store(path: Path) -> bool:
+    return path.suffix not in (".yaml", ".yml")
+
+
+def _image(path: Path) -> MapImage:
+    """The grid of a map file or of a map server's pair."""
+    from service.export import image_of, load_pgm_yaml
+    from service.store import occupancy_patch
+
+    if not _is_store(path):
+        return load_pgm_yaml(path)
+    with _open(path) as opened:
+        return image_of(occupancy_patch(opened))
+
+
+def _live_image(client: Client, base: str) -> MapImage:
+    """The last full grid of a running daemon."""
+    from mapping.frames import Pose2
+    from service.cdr import decode_grid
+    from service.export import MapImage
+
+    answers = client.get(f"{base}/map/grid", timeout_s=10.0)
+    if not answers:
+        raise Trouble(f"{base} has published no grid yet; let the robot drive a little, then try again")
+    grid = decode_grid(answers[0].payload)
+    x_m, y_m, _z = grid.origin_position
+    resolution_m = round(grid.resolution, 7)  # it travels as a float32
+    return MapImage(grid.cells, resolution_m, Pose2(x_m, y_m, 0.0))
+
+
+def _grid_info(image: MapImage) -> dict[str, Any]:
+    rows, columns = image.cells.shape
+    occupied, free = int((image.cells >= 65).sum()), int(((image.cells >= 0) & (image.cells < 20)).sum())
+    area = image.resolution_m**2
+    return {
+        "rows": rows,
+        "columns": columns,
+        "resolution_m": image.resolution_m,
+        "origin": {"x_m": image.origin.x_m, "y_m": image.origin.y_m, "yaw_rad": image.origin.yaw_rad},
+        "occupied_cells": occupied,
+        "free_m2": round(free * area, 3),
+    }
+
+
+def _report(document: Mapping[str, Any], as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps(document, indent=2, ensure_ascii=False))
+    elif {"path", "bytes", "sha256"} <= set(document):
+        typer.echo(_receipt_line(document))
+    else:
+        for line in _lines(document):
+            typer.echo(line)
+
+
+def _receipt_line(receipt: Mapping[str, Any]) -> str:
+    return f"{receipt['path']}  {receipt['bytes']} bytes  sha256 {receipt['sha256'][:16]}…  {receipt['saved_at']}"
+
+
+def _lines(value: Any, name: str = "") -> Sequence[str]:
+    """A JSON object for people: one value a line, the path to it in front."""
+    if isinstance(value, Mapping) and value:
+        return [line for key, entry in value.items() for line in _lines(entry, f"{name}.{key}" if name else str(key))]
+    return [f"{name}: {value}"]
+
+
+def _saved_at(saved_ns: Any) -> str:
+    from datetime import UTC, datetime
+
+    if not isinstance(saved_ns, int):
+        return "never saved"
+    return datetime.fromtimestamp(saved_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
