@@ -299,11 +299,11 @@ class _Source(Generic[WireT]):
         self._loop_trouble = None
         self._broken_until_ns = None
         self._restart(now_ns)
-        self._tell(now_ns)
+        self._tell_safely(now_ns)
 
     def lost(self, now_ns: int, why: str) -> None:
         self._wire_trouble = why
-        self._tell(now_ns)
+        self._tell_safely(now_ns)
 
     def receive(self, item: WireT, stamp_ns: int) -> None:
         if self._broken_until_ns is not None:
@@ -390,7 +390,7 @@ class _Source(Generic[WireT]):
         limit_ns = self._conversation.silence_limit_ns
         if state is LinkState.RUNNING:
             silence_ns = now_ns - self._alive_ns
-            if silence_ns > limit_ns:
+            if silence_ns >= limit_ns:
                 self._loop_trouble = f"no reading for {silence_ns / 1e9:.2f} s: check its power and cable"
                 self._restart_when_due(now_ns)
             else:
@@ -431,10 +431,21 @@ class _Source(Generic[WireT]):
         self._log.exception(now_ns, f"{self.name}: {type(error).__name__}", "%s: %s", self.name, self._loop_trouble)
         self._tell(now_ns)
 
+    def _identity(self) -> Identity | None:
+        if self._broken_until_ns is not None:  # do not ask a conversation that has just failed
+            return self._told[2] if self._told is not None else None
+        return self._conversation.identity
+
     def _trouble(self) -> str | None:
         if self._broken_until_ns is not None:
             return self._loop_trouble
         return self._conversation.trouble or self._loop_trouble
+
+    def _tell_safely(self, now_ns: int) -> None:
+        try:
+            self._tell(now_ns)
+        except Exception as error:
+            self._note_bug(now_ns, error)
 
     def _tell(self, now_ns: int) -> None:
         """Queue an event if there is news: another state, another identity, or (once a second) other words."""
@@ -443,7 +454,7 @@ class _Source(Generic[WireT]):
         else:
             state = LinkState.SILENT if self._loop_trouble is not None else self._conversation.state
             text = self._trouble() or _words(state)
-        news = (state, text, self._conversation.identity)
+        news = (state, text, self._identity())
         if news == self._told:
             return
         told = self._told

@@ -1,0 +1,579 @@
+"""The reader loop with a cranked clock and scripted ports; only the last tests start its thread."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from drivers.conversation import SetBaudRate
+from drivers.errors import PortAbsent, PortError
+from drivers.ports import Direction
+from drivers.queues import BoundedQueue
+from drivers.reader import POLL_PERIOD_NS, WireReader
+from drivers.readings import (
+    ChainReading,
+    ClockFit,
+    DeviceEvent,
+    Identity,
+    LinkState,
+    RangeReading,
+    RangeStatus,
+    Reading,
+    SourceCounters,
+)
+
+MS = 1_000_000
+
+
+def reading_at(stamp_ns: int) -> ChainReading:
+    return ChainReading(stamp_ns, (RangeReading(1, 1.0, RangeStatus.ECHO),))
+
+
+class Talker:
+    """A conversation that answers `?` with a reading for each `!` and does what the test tells it."""
+
+    def __init__(self) -> None:
+        self.state = LinkState.SILENT
+        self.trouble: str | None = None
+        self.identity: Identity | None = None
+        self.clock_fit: ClockFit | None = None
+        self.counters = SourceCounters()
+        self.silence_limit_ns = 300 * MS
+        self.connected_at: list[int] = []
+        self.requested_at: list[int] = []
+        self.outbox: list[bytes | SetBaudRate] = []
+        self.fail_in: str | None = None
+
+    def connected(self, now_ns: int) -> None:
+        self._may_fail("connected")
+        self.connected_at.append(now_ns)
+        self.state = LinkState.SILENT
+
+    def receive(self, chunk: bytes, stamp_ns: int) -> Iterator[Reading]:
+        self._may_fail("receive")
+        for _ in range(chunk.count(b"!")):
+            self.state = LinkState.RUNNING
+            yield reading_at(stamp_ns)
+
+    def requests(self, now_ns: int) -> Sequence[bytes | SetBaudRate]:
+        self._may_fail("requests")
+        self.requested_at.append(now_ns)
+        sent, self.outbox = self.outbox, []
+        return sent
+
+    def farewell(self) -> Sequence[bytes | SetBaudRate]:
+        self._may_fail("farewell")
+        return [b"bye"]
+
+    def _may_fail(self, where: str) -> None:
+        if self.fail_in == where:
+            raise ZeroDivisionError(f"bug in {where}")
+
+
+class ScriptedPort:
+    """Hands out what the bench queued; a read that waits cranks the clock."""
+
+    silence_reopen_s: float | None = None
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+        self.drops: dict[str, int] = {}
+        self.done: list[object] = []
+        self.closed = False
+        self.lost: str | None = None
+        self.writable = True
+
+    def read(self, timeout_s: float) -> list[tuple[bytes, int]]:
+        if self.lost is not None:
+            raise PortAbsent(self.lost)
+        assert 0 < timeout_s <= 0.02 + 1e-9
+        if not self.bench.inbox:
+            self.bench.now_ns += round(timeout_s * 1e9)
+            self.bench.play()
+        items, self.bench.inbox = self.bench.inbox, []
+        return items
+
+    def write(self, item: bytes) -> None:
+        if not self.writable:
+            raise PortError("takes no bytes")
+        self.done.append(item)
+
+    def set_baud(self, bits_per_s: int) -> None:
+        self.done.append(bits_per_s)
+
+    def close(self) -> None:
+        self.closed = True
+
+    def fileno(self) -> int | None:
+        return None
+
+
+class Bench:
+    """One wire, its conversations and the clock. `plan`: (time, what to do), in order."""
+
+    def __init__(self, *names: str, tap: Callable[[Direction, int, object], None] | None = None) -> None:
+        self.now_ns = 0
+        self.inbox: list[tuple[bytes, int]] = []
+        self.plan: list[tuple[int, Callable[[], object]]] = []
+        self.talkers = {name: Talker() for name in names or ("front",)}
+        self.items: list[tuple[int, str, Reading | DeviceEvent]] = []
+        self.ports: list[ScriptedPort] = []
+        self.opening_fails: PortError | None = None
+        self.attempts: list[int] = []
+        self.silence_reopen_s: float | None = None
+        self.reader: WireReader[bytes] = WireReader(
+            "bench", self.open, self.talkers, self.sink, clock=lambda: self.now_ns, wait=self.wait, tap=tap
+        )
+
+    def open(self) -> ScriptedPort:
+        self.attempts.append(self.now_ns)
+        if self.opening_fails is not None:
+            raise self.opening_fails
+        self.ports.append(ScriptedPort(self))
+        self.ports[-1].silence_reopen_s = self.silence_reopen_s
+        return self.ports[-1]
+
+    def wait(self, duration_s: float) -> None:
+        assert duration_s <= 1.0
+        self.now_ns += max(round(duration_s * 1e9), 1)
+        self.play()
+
+    def play(self) -> None:
+        while self.plan and self.plan[0][0] <= self.now_ns:
+            self.plan.pop(0)[1]()
+
+    def sink(self, source: str, item: Reading | DeviceEvent) -> None:
+        self.items.append((self.now_ns, source, item))
+
+    def say(self, chunk: bytes = b"!") -> None:
+        self.inbox.append((chunk, self.now_ns))
+
+    def say_from_to(self, start_ms: int, stop_ms: int, period_ms: int = 100) -> None:
+        self.plan += [(ms * MS, self.say) for ms in range(start_ms, stop_ms, period_ms)]
+
+    def run_until(self, ms: int) -> None:
+        while self.now_ns < ms * MS:
+            self.reader.step()
+
+    @property
+    def port(self) -> ScriptedPort:
+        return self.ports[-1]
+
+    @property
+    def talker(self) -> Talker:
+        return next(iter(self.talkers.values()))
+
+    def events(self, source: str = "front") -> list[tuple[int, LinkState, str]]:
+        return [
+            (at // MS, item.state, item.text)
+            for at, name, item in self.items
+            if name == source and isinstance(item, DeviceEvent)
+        ]
+
+    def states(self, source: str = "front") -> list[LinkState]:
+        return [state for _, state, _ in self.events(source)]
+
+    def readings(self, source: str = "front") -> int:
+        return sum(name == source and not isinstance(item, DeviceEvent) for _, name, item in self.items)
+
+
+def test_requests_are_polled_every_20_ms_and_after_each_receive() -> None:
+    bench = Bench()
+    bench.plan = [(150 * MS + 3 * MS, bench.say)]
+    bench.run_until(1000)
+    asked = bench.talker.requested_at
+    assert max(b - a for a, b in pairwise(asked)) <= POLL_PERIOD_NS
+    assert 160 * MS in asked or 153 * MS in asked
+    assert len(asked) == pytest.approx(51, abs=2), "and no more often: nothing busy-waits"
+
+
+def test_a_conversation_with_a_beat_is_asked_on_the_beat() -> None:
+    bench = Bench()
+    beat_ns = 7 * MS
+    due = [beat_ns]
+
+    class Beating(Talker):
+        def next_request_ns(self) -> int:
+            return due[0]
+
+        def requests(self, now_ns: int) -> Sequence[bytes | SetBaudRate]:
+            if now_ns >= due[0]:
+                self.requested_at.append(now_ns)
+                due[0] += beat_ns
+            return []
+
+    beating = Beating()
+    bench.reader = WireReader(
+        "bench", bench.open, {"front": beating}, bench.sink, clock=lambda: bench.now_ns, wait=bench.wait
+    )
+    bench.run_until(700)
+    assert beating.requested_at == list(range(beat_ns, 700 * MS + 1, beat_ns))
+
+
+def test_readings_and_events_come_in_order() -> None:
+    bench = Bench()
+    bench.say_from_to(50, 1000)
+    bench.run_until(1000)
+    assert bench.states() == [LinkState.SILENT, LinkState.RUNNING]
+    assert bench.readings() == 10
+    health = bench.reader.health()
+    assert health.is_open
+    assert health.openings == 1
+    source = health.sources["front"]
+    assert source.state is LinkState.RUNNING
+    assert source.readings == 10
+    assert source.rate_hz == pytest.approx(10.0)
+    assert source.age_ns is not None
+    assert source.age_ns <= 100 * MS
+
+
+def test_bytes_and_line_speed_keep_their_order() -> None:
+    bench = Bench()
+    bench.talker.outbox = [b"SS115200\n", SetBaudRate(115200), b"BM\n"]
+    bench.run_until(50)
+    assert bench.port.done == [b"SS115200\n", 115200, b"BM\n"]
+
+
+def test_silence_is_told_in_time_and_the_conversation_starts_anew() -> None:
+    bench = Bench()
+    bench.say_from_to(50, 1000)
+    bench.run_until(3000)
+    told_ms, state, text = bench.events()[-1]
+    assert state is LinkState.SILENT
+    assert told_ms - 950 <= 300 + 20
+    assert "no reading for" in text
+    assert bench.talker.connected_at[1] == told_ms * MS, "at once, as reset and resynchronisation"
+    bench.say_from_to(3000, 4000)
+    bench.run_until(4000)
+    assert bench.states()[-1] is LinkState.RUNNING
+    assert bench.reader.health().sources["front"].restarts == 2
+
+
+def test_a_device_that_comes_and_goes_is_not_restarted_in_a_rush() -> None:
+    """A reading every 400 ms with a limit of 300 ms: restarts wait longer and longer, but never end."""
+    bench = Bench()
+    bench.say_from_to(0, 20_000, 400)
+    bench.run_until(20_000)
+    gaps = [b - a for a, b in pairwise(bench.talker.connected_at)]
+    assert min(gaps[5:]) >= 390 * MS
+    assert max(gaps) <= 1_500 * MS
+    assert bench.states()[-1] in (LinkState.SILENT, LinkState.RUNNING)
+
+
+def test_endless_set_up_is_begun_anew() -> None:
+    bench = Bench()
+    bench.plan = [(100 * MS, lambda: setattr(bench.talker, "state", LinkState.STARTING))]
+    bench.run_until(25_000)
+    assert len(bench.talker.connected_at) == 3
+    assert bench.states()[:2] == [LinkState.SILENT, LinkState.STARTING]
+
+
+def test_a_lost_wire_is_absent_at_once_and_comes_back() -> None:
+    bench = Bench()
+    bench.say_from_to(20, 500)
+    bench.run_until(500)
+    bench.port.lost = "/dev/x was lost"
+    bench.reader.step()
+    assert bench.events()[-1] == (bench.now_ns // MS, LinkState.ABSENT, "/dev/x was lost")
+    assert bench.ports[0].closed
+    lost_ns = bench.now_ns
+    bench.say_from_to(700, 1500)
+    bench.run_until(1500)
+    assert len(bench.ports) == 2
+    assert bench.talker.connected_at[-1] - lost_ns <= 150 * MS
+    assert bench.states()[-2:] == [LinkState.SILENT, LinkState.RUNNING]
+    assert not bench.reader.health().drops
+
+
+def test_opening_is_tried_for_ever_never_rarer_than_each_second() -> None:
+    bench = Bench()
+    bench.opening_fails = PortAbsent("no /dev/x: is it plugged in?")
+    bench.run_until(60_000)
+    gaps = [b - a for a, b in pairwise(bench.attempts)]
+    assert max(gaps) <= 1_000 * MS + 1
+    assert gaps[0] >= 90 * MS
+    assert bench.events() == [(0, LinkState.ABSENT, "no /dev/x: is it plugged in?")], "told once"
+    bench.opening_fails = None
+    bench.say_from_to(60_500, 62_000)
+    bench.run_until(62_000)
+    assert bench.states()[-1] is LinkState.RUNNING
+
+
+def test_a_failing_write_gives_the_wire_up() -> None:
+    bench = Bench()
+    bench.run_until(100)
+    bench.port.writable = False
+    bench.talker.outbox = [b"?"]
+    bench.run_until(140)
+    assert bench.states()[-1] is LinkState.ABSENT
+
+
+def test_a_wire_on_which_nothing_at_all_is_heard_is_opened_anew_quietly() -> None:
+    bench = Bench()
+    bench.silence_reopen_s = 2.0
+    bench.run_until(9_000)
+    assert len(bench.ports) == pytest.approx(5, abs=1)
+    assert all(port.closed for port in bench.ports[:-1])
+    assert set(bench.states()) == {LinkState.SILENT}
+
+
+def test_port_drops_survive_reopening() -> None:
+    bench = Bench()
+    bench.run_until(100)
+    bench.port.drops["tx_full"] = 3
+    bench.port.lost = "gone"
+    bench.run_until(400)
+    bench.port.drops["tx_full"] = 2
+    assert bench.reader.health().drops == {"tx_full": 5}
+
+
+@pytest.mark.parametrize("where", ["receive", "requests", "connected"])
+def test_a_bug_in_one_conversation_hurts_no_other(where: str, caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench("front", "rear")
+    bench.say_from_to(50, 10_000)
+    bench.run_until(500)
+    bench.talkers["front"].fail_in = where
+    if where == "connected":
+        bench.talkers["front"].silence_limit_ns = 1  # makes the loop restart it
+    with caplog.at_level(logging.ERROR):
+        bench.run_until(5_000)
+    assert bench.readings("rear") == 50
+    assert bench.states("rear") == [LinkState.SILENT, LinkState.RUNNING]
+    assert bench.states()[-1] is LinkState.SILENT
+    assert "bug" in bench.events()[-1][2]
+    health = bench.reader.health().sources["front"]
+    assert health.bugs == health.counters.drops["bug"] == pytest.approx(5, abs=1)
+    tracebacks = [record for record in caplog.records if record.exc_info]
+    assert len(tracebacks) == 1, "one a minute"
+    bench.talkers["front"].fail_in = None
+    bench.talkers["front"].silence_limit_ns = 300 * MS
+    bench.run_until(7_000)
+    assert bench.states()[-1] is LinkState.RUNNING
+
+
+def test_a_property_that_raises_is_a_bug_too() -> None:
+    bench = Bench("front", "rear")
+
+    class Broken(Talker):
+        @property
+        def state(self) -> LinkState:
+            raise RuntimeError("no state")
+
+        @state.setter
+        def state(self, value: LinkState) -> None:
+            pass
+
+    talkers: dict[str, Any] = {"front": Broken(), "rear": bench.talkers["rear"]}
+    bench.reader = WireReader("bench", bench.open, talkers, bench.sink, clock=lambda: bench.now_ns, wait=bench.wait)
+    bench.say_from_to(50, 1_000)
+    bench.run_until(1_000)
+    assert bench.readings("rear") == 10
+
+
+def test_events_tell_identity_and_trouble_but_not_in_a_flood() -> None:
+    bench = Bench()
+    bench.say_from_to(0, 10_000, 10)
+    numbers = iter(range(10_000))
+    bench.plan += [
+        (ms * MS, lambda: setattr(bench.talker, "trouble", f"bad {next(numbers)}")) for ms in range(0, 5000, 20)
+    ]
+    bench.plan.sort(key=lambda step: step[0])
+    bench.run_until(1_000)
+    bench.talker.identity = Identity(vendor="Maker")
+    bench.run_until(5_000)
+    assert 5 <= len(bench.events()) <= 9
+    identities = [item.identity for _, _, item in bench.items if isinstance(item, DeviceEvent)]
+    assert identities[-1] == Identity(vendor="Maker")
+
+
+def test_the_log_has_one_line_per_cause_per_minute(caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench()
+    with caplog.at_level(logging.INFO):
+        for start in range(0, 90_000, 1_000):  # comes and goes once a second
+            bench.say_from_to(start, start + 500, 100)
+        bench.run_until(90_000)
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(bench.events()) > 100
+    assert len(lines) <= 4
+    assert any("times more" in line for line in lines)
+
+
+def test_the_tap_hears_everything_in_order() -> None:
+    heard: list[tuple[Direction, int, object]] = []
+    bench = Bench(tap=lambda direction, stamp_ns, item: heard.append((direction, stamp_ns, item)))
+    bench.talker.outbox = [b"?", SetBaudRate(9600)]
+    bench.plan = [(30 * MS, lambda: bench.say(b"ab!"))]
+    bench.run_until(40)
+    bench.port.lost = "gone"
+    bench.reader.step()
+    assert heard[0] == (Direction.CONNECTED, 0, "front")
+    assert [(direction, item) for direction, _, item in heard[1:]] == [
+        (Direction.OUT, b"?"),
+        (Direction.OUT, SetBaudRate(9600)),
+        (Direction.IN, b"ab!"),
+        (Direction.LOST, "gone"),
+    ]
+    assert heard[1][1] in bench.talker.requested_at, "the time given to requests(), so that a replay can repeat it"
+
+
+def test_close_says_farewell() -> None:
+    bench = Bench("front", "rear")
+    bench.talkers["front"].fail_in = "farewell"
+    bench.run_until(50)
+    assert bench.reader.stop()
+    assert bench.port.done == [b"bye"], "a bug in one farewell does not stop the other"
+    assert bench.port.closed
+
+
+def test_close_of_a_stuck_wire() -> None:
+    bench = Bench()
+    bench.run_until(50)
+    bench.port.writable = False
+    bench.reader.close()
+    assert bench.port.closed
+
+
+# ---- the thread
+
+
+class LivePort:
+    """A port of real time: silent, or hanging, or raising what no port should."""
+
+    silence_reopen_s: float | None = None
+
+    def __init__(self, hang: threading.Event | None = None) -> None:
+        self.drops: dict[str, int] = {}
+        self.hang = hang
+        self.written: list[bytes] = []
+        self.closed = False
+        self.explode = False
+
+    def read(self, timeout_s: float) -> list[tuple[bytes, int]]:
+        if self.explode:
+            self.explode = False
+            raise ZeroDivisionError("bug in a port")
+        if self.hang is not None:
+            self.hang.wait(30.0)
+        time.sleep(timeout_s)
+        return [(b"!", time.monotonic_ns())]
+
+    def write(self, item: bytes) -> None:
+        self.written.append(item)
+
+    def set_baud(self, bits_per_s: int) -> None: ...
+
+    def close(self) -> None:
+        self.closed = True
+
+    def fileno(self) -> int | None:
+        return None
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_thread_runs_and_stops_with_farewell() -> None:
+    port = LivePort()
+    queue: BoundedQueue[Reading | DeviceEvent] = BoundedQueue(1000)
+    reader: WireReader[bytes] = WireReader(
+        "live", lambda: port, {"front": Talker()}, queue.put, clock=time.monotonic_ns
+    )
+    reader.start()
+    wait_for(lambda: len(queue) > 5)
+    assert reader.health().sources["front"].state is LinkState.RUNNING
+    assert reader.stop(2.0)
+    assert port.written == [b"bye"]
+    assert port.closed
+
+
+def test_thread_survives_a_bug_in_the_port() -> None:
+    ports = [LivePort(), LivePort()]
+    ports[0].explode = True
+    waiting = iter(ports)
+    queue: BoundedQueue[Reading | DeviceEvent] = BoundedQueue(1000)
+    reader: WireReader[bytes] = WireReader(
+        "live", lambda: next(waiting), {"front": Talker()}, queue.put, clock=time.monotonic_ns
+    )
+    reader.start()
+    wait_for(lambda: reader.health().sources["front"].readings > 3)
+    assert reader.stop(2.0)
+    assert ports[0].closed
+
+
+def test_stop_does_not_wait_for_a_hanging_wire() -> None:
+    hang = threading.Event()
+    reader: WireReader[bytes] = WireReader(
+        "live", lambda: LivePort(hang), {"front": Talker()}, lambda source, item: None, clock=time.monotonic_ns
+    )
+    reader.start()
+    wait_for(lambda: reader.health().is_open)
+    started = time.monotonic()
+    assert not reader.stop(0.2)
+    assert time.monotonic() - started < 1.0
+    hang.set()
+
+
+# ---- the queue
+
+
+def event(text: str) -> DeviceEvent:
+    return DeviceEvent(0, LinkState.SILENT, text)
+
+
+def test_queue_drops_the_oldest_reading_of_the_loudest_and_keeps_events() -> None:
+    queue: BoundedQueue[Reading | DeviceEvent] = BoundedQueue(5)
+    queue.put("quiet", reading_at(1))
+    queue.put("loud", event("first"))
+    for stamp in range(10, 20):
+        queue.put("loud", reading_at(stamp))
+    items = queue.get_all(0.0)
+    assert [(source, item.stamp_ns) for source, item in items] == [
+        ("quiet", 1),
+        ("loud", 0),
+        ("loud", 17),
+        ("loud", 18),
+        ("loud", 19),
+    ]
+    assert queue.dropped() == {"loud": 7}
+    assert queue.get(0.0) is None
+
+
+def test_queue_of_events_only_drops_the_oldest() -> None:
+    queue: BoundedQueue[Reading | DeviceEvent] = BoundedQueue(2)
+    for text in "abc":
+        queue.put("x", event(text))
+    assert [item.text for _, item in queue.get_all(0.0) if isinstance(item, DeviceEvent)] == ["b", "c"]
+    assert queue.dropped() == {"x": 1}
+
+
+def test_queue_wakes_the_waiting() -> None:
+    queue: BoundedQueue[Reading | DeviceEvent] = BoundedQueue(2)
+    threading.Timer(0.05, queue.put, ("x", reading_at(7))).start()
+    got = queue.get(5.0)
+    assert got is not None
+    assert got[1].stamp_ns == 7
+
+
+def test_queue_counts_stay_right_when_taken_one_by_one() -> None:
+    queue: BoundedQueue[Reading | DeviceEvent] = BoundedQueue(3)
+    for stamp in range(100):
+        queue.put("x", reading_at(stamp))
+        if stamp % 2:
+            assert queue.get(0.0) is not None
+    assert len(queue) == 2
+    assert queue.dropped() == {"x": 48}
+
+
+def test_a_queue_needs_room() -> None:
+    with pytest.raises(ValueError):
+        BoundedQueue[DeviceEvent](0)
