@@ -298,3 +298,73 @@ def arc_in_sectors(arc: Any, off_axis: Any, edges: Any, width: float, range_max:
                     least[sector] = min(at_t0, at_t1)
                     at[sector] = math.atan2(ay + t * ey, ax + t * ex)
     return best, at
+
+
+@njit(cache=True, nogil=True)
+def line_through_cells(
+    line: Any, x0: float, y0: float, edge: float, rows: int, cols: int, polygon: Any, reach: float
+) -> tuple[Any, Any, Any]:
+    """Per cell of a raster, how near a polyline comes to the origin within it, outside the vehicle's outline.
+
+    Returns (rows, cols) distances, inf where the line does not pass, and x, y of that point (of the whole stretch,
+    where the outline is in the way).
+    """
+    best = np.full((rows, cols), math.inf)
+    at_x = np.full((rows, cols), math.nan)
+    at_y = np.full((rows, cols), math.nan)
+    slack = 1e-9
+    for k in range(len(line) - 1):
+        ax, ay, bx, by = line[k, 0] - x0, line[k, 1] - y0, line[k + 1, 0] - x0, line[k + 1, 1] - y0
+        ex, ey = bx - ax, by - ay
+        if ex == 0.0 and ey == 0.0:
+            continue
+        row_lo = max(0, math.floor((min(ay, by) - slack) / edge))
+        row_hi = min(rows - 1, math.floor((max(ay, by) + slack) / edge))
+        for row in range(row_lo, row_hi + 1):
+            t0, t1 = between(ay, ey, row * edge - slack, (row + 1) * edge + slack)
+            if t0 > t1:
+                continue
+            xa, xb = ax + t0 * ex, ax + t1 * ex
+            col_lo = max(0, math.floor((min(xa, xb) - slack) / edge))
+            col_hi = min(cols - 1, math.floor((max(xa, xb) + slack) / edge))
+            for col in range(col_lo, col_hi + 1):
+                u0, u1 = between(ax, ex, col * edge - slack, (col + 1) * edge + slack)
+                u0, u1 = max(u0, t0), min(u1, t1)
+                if u0 > u1:
+                    continue
+                px, py = ax + u0 * ex + x0, ay + u0 * ey + y0
+                qx, qy = ax + u1 * ex + x0, ay + u1 * ey + y0
+                distance = nearest_outside(px, py, qx, qy, polygon, reach)
+                if distance < best[row, col]:
+                    best[row, col] = distance
+                    at_x[row, col], at_y[row, col] = nearest_on(px, py, qx, qy)
+    return best, at_x, at_y
+
+
+@njit(cache=True, nogil=True)
+def between(start: float, step: float, low: float, high: float) -> tuple[float, float]:
+    """The stretch of t in [0, 1] for which low <= start + t * step <= high; the first greater: none."""
+    if step == 0.0:
+        if low <= start <= high:
+            return 0.0, 1.0
+        return 1.0, 0.0
+    t0, t1 = (low - start) / step, (high - start) / step
+    if t0 > t1:
+        t0, t1 = t1, t0
+    return max(t0, 0.0), min(t1, 1.0)
+
+
+@njit(cache=True, nogil=True)
+def nearest_in_cells(x: Any, y: Any, x0: float, y0: float, edge: float, rows: int, cols: int) -> tuple[Any, Any, Any]:
+    """Per cell of a raster the nearest of many points: its distance from the origin (inf: none), x and y."""
+    best = np.full((rows, cols), math.inf)
+    at_x = np.full((rows, cols), math.nan)
+    at_y = np.full((rows, cols), math.nan)
+    for k in range(len(x)):
+        col, row = math.floor((x[k] - x0) / edge + 1e-9), math.floor((y[k] - y0) / edge + 1e-9)
+        if 0 <= row < rows and 0 <= col < cols:
+            distance = math.hypot(x[k], y[k])
+            if distance < best[row, col]:
+                best[row, col] = distance
+                at_x[row, col], at_y[row, col] = x[k], y[k]
+    return best, at_x, at_y

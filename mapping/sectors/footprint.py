@@ -39,7 +39,8 @@ def signed_area(polygon: F64) -> float:
 def in_polygon(points: ArrayLike, polygon: F64) -> Bool:
     """(N,) which of the (N, 2) points lie inside; one on the border may count either way."""
     p = np.ascontiguousarray(np.atleast_2d(np.asarray(points, dtype=np.float64)))
-    return kernels.inside_polygon(p[:, 0].copy(), p[:, 1].copy(), polygon)
+    inside: Bool = kernels.inside_polygon(p[:, 0].copy(), p[:, 1].copy(), polygon)
+    return inside
 
 
 def is_star_shaped(polygon: F64) -> bool:
@@ -79,7 +80,8 @@ class Outline:
         obstacle; a ray that misses the vehicle has k = 0. NaN bearings give NaN.
         """
         bearing = np.atleast_1d(np.asarray(bearing_rad, dtype=np.float64))
-        return kernels.border_distances(np.ascontiguousarray(bearing), self.polygon)
+        border: F64 = kernels.border_distances(np.ascontiguousarray(bearing), self.polygon)
+        return border
 
     def contains(self, points: F64) -> Bool:
         """(N,) which of the (N, 2) points, virtual sensor frame, lie on the vehicle."""

@@ -74,8 +74,8 @@ def test_a_sensor_on_the_bumper_is_outside() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [[], [[0, 0], [1, 1]], [[0, 0], [1, 1], [2, 2]], [[0, 0], [1, math.nan], [2, 0]], [1, 2]]
+    "bad", [[], [[0, 0], [1, 1]], [[0, 0], [1, 1], [2, 2]], [[0, 0], [1, math.nan], [2, 0]], [[1], [2]]]
 )
-def test_what_is_no_outline_is_refused(bad: list[object]) -> None:
+def test_what_is_no_outline_is_refused(bad: list[list[float]]) -> None:
     with pytest.raises(ValueError):
         checked_polygon(bad)

@@ -1,0 +1,229 @@
+"""What every source says about the sectors of one map, and what that comes to together.
+
+The rules, each there so that no loss of data makes a sector freer:
+
+- the nearest obstacle of all fresh evidence wins; a sector is free only as far as one fresh source saw all of it;
+- evidence that has become too old, or whose device is lost, makes its sectors stale, unless a fresh obstacle is at
+  least as near as what it knew;
+- an obstacle in a direction that a newer scan says nothing about stays, with its old stamp, until a valid beam looks
+  that way again;
+- before every source has been heard once no sector is free: nobody knows what the silent one would have seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.sectors.snapshot import SectorState
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+I16 = NDArray[np.int16]
+I8 = NDArray[np.int8]
+Bool = NDArray[np.bool_]
+Looked = Callable[[F64, F64, F64], Bool]
+"""Of obstacles, given by distance and two coordinates, (N,) each: in whose direction did the new reading look?"""
+
+
+@dataclass(slots=True)
+class Finding:
+    """What one reading says about N sectors.
+
+    obstacle_m: (N,) distance of the nearest obstacle, inf none.  u, v: (N,) its coordinates (polar maps: bearing in
+    u).  free_m: (N,) up to which all of the sector was seen free, 0 nowhere.  blind: (N,) sectors the reading was
+    meant to see and could not.
+    """
+
+    obstacle_m: F64
+    u: F64
+    v: F64
+    free_m: F64
+    blind: Bool
+
+
+@dataclass(slots=True)
+class _Channel:
+    source: int
+    stamp_ns: int
+    dead: bool
+    finding: Finding
+    held_m: F64
+    held_u: F64
+    held_v: F64
+    held_stamp_ns: I64
+    held_dead: Bool
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What is known together: (N,) arrays as in PolarSnapshot; u, v: of the nearest obstacle."""
+
+    state: I8
+    distance_m: F64
+    u: F64
+    v: F64
+    age_ns: I64
+    source: I16
+
+
+class Evidence:
+    """The newest findings of every source and channel about the sectors of one map.
+
+    stale_after_ns: for all sources, or one for each.  wait_for_sources: no free sector before all have been heard.
+    """
+
+    def __init__(
+        self, *, count: int, sources: tuple[str, ...], stale_after_ns: int | tuple[int, ...], wait_for_sources: bool
+    ) -> None:
+        limits = (stale_after_ns,) * len(sources) if isinstance(stale_after_ns, int) else tuple(stale_after_ns)
+        if not sources or len(set(sources)) != len(sources):
+            raise ValueError("a sector map needs sources with different names")
+        if len(limits) != len(sources) or min(limits) <= 0:
+            raise ValueError("stale_after_ns must be positive: one number, or one for each source")
+        self.sources = sources
+        self._count = count
+        self._limits = limits
+        self._channels: dict[tuple[int, int], _Channel] = {}
+        self._heard = [not wait_for_sources] * len(sources)
+
+    def index(self, source: str) -> int:
+        """Of a source by name; ValueError names the ones there are."""
+        try:
+            return self.sources.index(source)
+        except ValueError:
+            raise ValueError(f"{source!r} does not feed this sector map, only {', '.join(self.sources)}") from None
+
+    def revise(self, source: str, channel: int, finding: Finding, *, stamp_ns: int, looked: Looked | None) -> None:
+        """Replace a channel's finding by a newer one. Older ones than the last are passed over.
+
+        looked: None if the reading looked everywhere its predecessor did.
+        """
+        at = self.index(source)
+        self._heard[at] = True
+        old = self._channels.get((at, channel))
+        if old is not None and not old.dead and stamp_ns < old.stamp_ns:
+            return
+        new = _Channel(
+            at,
+            stamp_ns,
+            False,
+            finding,
+            np.full(self._count, np.inf),
+            np.full(self._count, np.nan),
+            np.full(self._count, np.nan),
+            np.zeros(self._count, dtype=np.int64),
+            np.zeros(self._count, dtype=bool),
+        )
+        if old is not None and looked is not None:
+            _hold(new, old, looked)
+        self._channels[at, channel] = new
+
+    def nothing_heard(self, source: str, channel: int, finding: Finding, *, stamp_ns: int) -> None:
+        """An invalid reading: what the channel said before stays and ages; a first one only says where it is blind."""
+        at = self.index(source)
+        if (at, channel) not in self._channels:
+            self.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
+
+    def lost(self, source: str) -> None:
+        """The device is gone: all it said is stale from now on, until each channel speaks again."""
+        at = self.index(source)
+        for channel in self._channels.values():
+            if channel.source == at:
+                channel.dead = True
+                channel.held_dead[:] = True
+
+    def verdict(self, now_ns: int) -> Verdict:
+        """What is known of each sector at an instant."""
+        count = self._count
+        if not self._channels:
+            nan = np.full(count, np.nan)
+            return Verdict(
+                np.full(count, SectorState.UNKNOWN, dtype=np.int8),
+                nan,
+                nan.copy(),
+                nan.copy(),
+                np.full(count, -1, dtype=np.int64),
+                np.full(count, -1, dtype=np.int16),
+            )
+        for channel in self._channels.values():
+            # A stamp far ahead is a broken clock: it must not keep an old reading young.
+            if abs(now_ns - channel.stamp_ns) > self._limits[channel.source]:
+                channel.dead = True
+        return self._judge(now_ns)
+
+    def _judge(self, now_ns: int) -> Verdict:
+        obstacle, u, v, free, stamp, fresh, source, blind = self._table(now_ns)
+        sector = np.arange(self._count)
+        nearest = np.where(fresh, obstacle, np.inf)
+        at_nearest = nearest.argmin(axis=0)
+        nearest_m = nearest[at_nearest, sector]
+        seen = np.where(fresh, free, 0.0)
+        at_seen = seen.argmax(axis=0)
+        seen_m = seen[at_seen, sector]
+        known = np.isfinite(obstacle) | (free > 0.0)
+        old = np.where(~fresh & known, np.where(np.isfinite(obstacle), obstacle, free), np.inf)
+        at_old = old.argmin(axis=0)
+        old_m = old[at_old, sector]
+
+        state = np.full(self._count, SectorState.UNKNOWN, dtype=np.int8)
+        may_be_free = (seen_m > 0.0) & ~(blind & fresh).any(axis=0) & all(self._heard)
+        state[may_be_free] = SectorState.FREE
+        state[np.isfinite(nearest_m)] = SectorState.OBSTACLE
+        state[old_m < nearest_m * (1.0 - 1e-12)] = SectorState.STALE
+        is_stale, is_free = state == SectorState.STALE, state == SectorState.FREE
+
+        # The obstacle to show: of the fresh ones, or of all once the sector is stale.
+        at_any = obstacle.argmin(axis=0)
+        at = np.where(is_stale, at_any, at_nearest)
+        shown = obstacle[at, sector]
+        has_point = (is_stale | (state == SectorState.OBSTACLE)) & np.isfinite(shown)
+        distance = np.where(has_point, shown, np.where(is_free, seen_m, np.nan))
+        decides = np.where(is_stale, at_old, np.where(is_free, at_seen, at_nearest))
+        is_known = state != SectorState.UNKNOWN
+        return Verdict(
+            state,
+            distance,
+            np.where(has_point, u[at, sector], np.nan),
+            np.where(has_point, v[at, sector], np.nan),
+            np.where(is_known, np.maximum(now_ns - stamp[decides, sector], 0), -1).astype(np.int64),
+            np.where(is_known, source[decides], -1).astype(np.int16),
+        )
+
+    def _table(self, now_ns: int) -> tuple[F64, F64, F64, F64, I64, Bool, I64, Bool]:
+        # One row for each finding in force, then one for what each channel still holds from earlier ones.
+        channels = [self._channels[key] for key in sorted(self._channels)]
+        holding = [c for c in channels if np.isfinite(c.held_m).any()]
+        none, nowhere = np.zeros(self._count), np.zeros(self._count, dtype=bool)
+        obstacle = np.stack([c.finding.obstacle_m for c in channels] + [c.held_m for c in holding])
+        u = np.stack([c.finding.u for c in channels] + [c.held_u for c in holding])
+        v = np.stack([c.finding.v for c in channels] + [c.held_v for c in holding])
+        free = np.stack([c.finding.free_m for c in channels] + [none] * len(holding))
+        blind = np.stack([c.finding.blind for c in channels] + [nowhere] * len(holding))
+        stamp = np.stack([np.full(self._count, c.stamp_ns) for c in channels] + [c.held_stamp_ns for c in holding])
+        fresh = np.stack(
+            [np.full(self._count, not c.dead) for c in channels]
+            + [~c.held_dead & (now_ns - c.held_stamp_ns <= self._limits[c.source]) for c in holding]
+        )
+        source = np.array([c.source for c in channels] + [c.source for c in holding])
+        return obstacle, u, v, free, stamp, fresh, source, blind
+
+
+def _hold(new: _Channel, old: _Channel, looked: Looked) -> None:
+    # Of the last finding and what was held before it: the nearest obstacle nobody has looked at since.
+    stamps, dead = np.full(len(old.held_m), old.stamp_ns), np.full(len(old.held_m), old.dead)
+    generations = (
+        (old.held_m, old.held_u, old.held_v, old.held_stamp_ns, old.held_dead),
+        (old.finding.obstacle_m, old.finding.u, old.finding.v, stamps, dead),
+    )
+    for obstacle_m, u, v, stamp_ns, is_dead in generations:
+        nearer = np.isfinite(obstacle_m) & (obstacle_m < new.finding.obstacle_m) & (obstacle_m < new.held_m)
+        stays = np.flatnonzero(nearer)
+        if len(stays) == 0:
+            continue
+        stays = stays[~looked(obstacle_m[stays], u[stays], v[stays])]
+        new.held_m[stays], new.held_u[stays], new.held_v[stays] = obstacle_m[stays], u[stays], v[stays]
+        new.held_stamp_ns[stays], new.held_dead[stays] = stamp_ns[stays], is_dead[stays]

@@ -1,0 +1,105 @@
+"""Readings as both kinds of sector map take them: checked, and without the vehicle's own reflections."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mapping.frames import Pose2
+from mapping.sectors.footprint import in_polygon
+from mapping.sectors.sight import Sight, arc_of_cone, end_points, median_spacing, sight_of_beams, sight_of_cone
+
+F64 = NDArray[np.float64]
+
+
+class SpacingMemory:
+    """The finest spacing of beams each source has shown: a scan that lost every other beam must not pass for whole."""
+
+    def __init__(self) -> None:
+        self._finest: dict[str, float] = {}
+
+    def of(self, source: str, bearing_rad: F64, spacing_rad: float | None) -> float:
+        """The spacing to judge gaps by; spacing_rad is the device's own figure, if it is known."""
+        if spacing_rad is not None:
+            return spacing_rad
+        median = median_spacing(bearing_rad)
+        known = self._finest.get(source)
+        if median is not None and median > 0.0 and (known is None or median < known):
+            known = self._finest[source] = median
+        return known if known is not None else 0.0
+
+    def forget(self, source: str) -> None:
+        """The device is gone; what answers next may be set differently."""
+        self._finest.pop(source, None)
+
+
+def checked_beams(bearing_rad: ArrayLike, range_m: ArrayLike) -> tuple[F64, F64]:
+    """Two (N,) float64 arrays; a beam without a finite bearing is invalid. ValueError if the shapes differ."""
+    bearing = np.ascontiguousarray(bearing_rad, dtype=np.float64)
+    ranges = np.ascontiguousarray(range_m, dtype=np.float64)
+    if bearing.ndim != 1 or bearing.shape != ranges.shape:
+        raise ValueError(f"bearings and ranges must be (N,) alike, got {bearing.shape} and {ranges.shape}")
+    good = np.isfinite(bearing)
+    return (bearing, ranges) if good.all() else (bearing[good], ranges[good])
+
+
+def without_self(bearing_rad: F64, range_m: F64, base_from_sensor: Pose2, footprint: F64) -> F64:
+    """(N,) ranges in which what ends on the vehicle itself is invalid: it is no obstacle and frees nothing."""
+    reach_m = float(np.hypot(footprint[:, 0], footprint[:, 1]).max()) + math.hypot(
+        base_from_sensor.x_m, base_from_sensor.y_m
+    )
+    near = np.flatnonzero(np.isfinite(range_m) & (range_m >= 0.0) & (range_m <= reach_m))
+    if len(near) == 0:
+        return range_m
+    r, a = range_m[near], bearing_rad[near]
+    own = in_polygon(base_from_sensor.apply(np.stack((r * np.cos(a), r * np.sin(a)), axis=-1)), footprint)
+    cleaned = range_m.copy()
+    cleaned[near[own]] = np.nan
+    return cleaned
+
+
+def see_beams(
+    bearing_rad: F64,
+    range_m: F64,
+    *,
+    range_min_m: float,
+    range_max_m: float,
+    spacing_rad: float,
+    virtual_from_sensor: Pose2,
+) -> tuple[Sight, F64]:
+    """What a fan of beams has seen, and its (M, 2) obstacles in the virtual sensor's frame."""
+    sight = sight_of_beams(
+        bearing_rad,
+        range_m,
+        range_max_m=range_max_m,
+        spacing_rad=spacing_rad,
+        virtual_from_sensor=virtual_from_sensor,
+    )
+    points = end_points(bearing_rad, range_m, range_min_m=range_min_m, virtual_from_sensor=virtual_from_sensor)
+    return sight, points
+
+
+def see_cone(
+    range_m: float,
+    *,
+    cone_rad: float,
+    range_min_m: float,
+    range_max_m: float,
+    free_share: float,
+    virtual_from_transducer: Pose2,
+) -> tuple[Sight, F64, F64]:
+    """What a sonar has seen: its star, the (M, 2) arc the echo came from (empty: no echo), and (M,) angles off axis."""
+    echo_m = range_min_m if math.isinf(range_m) and range_m < 0.0 else range_m
+    free_m = 0.0 if echo_m <= range_min_m else free_share * min(echo_m, range_max_m)
+    sight = sight_of_cone(
+        cone_rad=cone_rad,
+        free_m=free_m,
+        near_m=range_min_m if free_m > 0.0 else 0.0,
+        virtual_from_transducer=virtual_from_transducer,
+    )
+    if math.isinf(echo_m):
+        return sight, np.empty((0, 2)), np.empty(0)
+    arc, off_axis = arc_of_cone(cone_rad=cone_rad, range_m=echo_m, virtual_from_transducer=virtual_from_transducer)
+    return sight, arc, off_axis

@@ -1,0 +1,150 @@
+"""What a range sensor has seen: obstacles, and the area it looked through.
+
+Every beam stands for a thin sector around it: half-way to its neighbours where they are no farther than 1.5 times the
+usual spacing, half a spacing elsewhere. The area seen is the union of these thin sectors, each as long as its range;
+that is a star about the sensor. A cone is a fan of such sectors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.frames import Pose2
+
+F64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+GAP_MAX_SPACINGS = 1.5
+TURN = 2.0 * math.pi
+_TOUCH_RAD = 1e-9
+_SAME_PLACE_M = 1e-9
+_CONE_STEP_RAD = math.radians(2.0)
+_ARC_STEP_RAD = math.radians(0.5)
+_FRONT_RAD = math.radians(100.0)  # a little more than half the front, so that a flush bumper leaves no seam
+_LEAST_RANGE_M = 1e-6  # an obstacle at range zero still has a bearing
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """The star a sensor has seen, and which way it looked at all.
+
+    virtual_from_sensor: where it stands.  lo_rad, hi_rad, length_m: (M,) thin sectors with a length, sensor frame,
+    ascending, apart, within one turn.  looked_lo_rad, looked_hi_rad: (K,) the same for every valid beam, also those
+    too close to measure.
+    """
+
+    virtual_from_sensor: Pose2
+    lo_rad: F64
+    hi_rad: F64
+    length_m: F64
+    looked_lo_rad: F64
+    looked_hi_rad: F64
+
+    @property
+    def from_origin(self) -> bool:
+        """Whether the sensor stands on the virtual origin."""
+        return math.hypot(self.virtual_from_sensor.x_m, self.virtual_from_sensor.y_m) < _SAME_PLACE_M
+
+    def border(self) -> F64:
+        """(M, 2) corners of the star, virtual sensor frame, closed, counter-clockwise; chords stand for its arcs."""
+        if len(self.lo_rad) == 0:
+            return np.empty((0, 2))
+        corners = np.zeros((len(self.lo_rad), 3, 2))
+        corners[:, 0, 0], corners[:, 0, 1] = self.length_m * np.cos(self.lo_rad), self.length_m * np.sin(self.lo_rad)
+        corners[:, 1, 0], corners[:, 1, 1] = self.length_m * np.cos(self.hi_rad), self.length_m * np.sin(self.hi_rad)
+        following = np.append(self.lo_rad[1:], self.lo_rad[0] + TURN)
+        joined = following - self.hi_rad <= _TOUCH_RAD
+        corners[joined, 2] = corners[joined, 1]  # elsewhere the border goes home to the sensor and out again
+        return np.ascontiguousarray(self.virtual_from_sensor.apply(corners.reshape(-1, 2)))
+
+    def contains(self, points: F64) -> Bool:
+        """(N,) which (N, 2) points, virtual sensor frame, were seen to be free."""
+        seen, at, distance = self._beam_at(points, self.lo_rad, self.hi_rad)
+        if not seen.any():
+            return seen
+        inner = self.length_m * np.cos(0.5 * (self.hi_rad - self.lo_rad))
+        return np.asarray(seen & (distance <= inner[at]))
+
+    def looked_at(self, points: F64) -> Bool:
+        """(N,) in which directions of (N, 2) points a valid beam looked, whatever it saw there."""
+        return self._beam_at(points, self.looked_lo_rad, self.looked_hi_rad)[0]
+
+    def _beam_at(self, points: F64, lo_rad: F64, hi_rad: F64) -> tuple[Bool, NDArray[np.int64], F64]:
+        own = self.virtual_from_sensor.inverse().apply(points)
+        distance = np.hypot(own[:, 0], own[:, 1])
+        if len(lo_rad) == 0:
+            return np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=np.int64), distance
+        along = (np.arctan2(own[:, 1], own[:, 0]) - lo_rad[0] + _TOUCH_RAD) % TURN + lo_rad[0] - _TOUCH_RAD
+        at = np.maximum(np.searchsorted(lo_rad, along + _TOUCH_RAD, side="right") - 1, 0)
+        return np.asarray(along <= hi_rad[at] + _TOUCH_RAD), at, distance
+
+
+def median_spacing(bearing_rad: F64) -> float | None:
+    """The usual angle between neighbouring beams; None for fewer than eight, too few to tell."""
+    if len(bearing_rad) < 8:
+        return None
+    return float(np.median(np.abs((np.diff(bearing_rad) + math.pi) % TURN - math.pi)))
+
+
+def sight_of_beams(
+    bearing_rad: F64, range_m: F64, *, range_max_m: float, spacing_rad: float, virtual_from_sensor: Pose2
+) -> Sight:
+    """What a fan of beams has seen. bearing_rad, range_m: (N,) in any order; see mapping.scan for inf and NaN.
+
+    A finite range beyond range_max_m is an obstacle where it says, but frees nothing.
+    """
+    along = (bearing_rad - (bearing_rad[0] if len(bearing_rad) else 0.0)) % TURN
+    order = np.argsort(along, kind="stable")
+    along, length = along[order], range_m[order].copy()
+    if len(along) == 0:
+        empty = np.empty(0)
+        return Sight(virtual_from_sensor, empty, empty, empty, empty, empty)
+    gap = np.append(np.diff(along), along[0] + TURN - along[-1])
+    reach = np.where(gap <= GAP_MAX_SPACINGS * spacing_rad * (1.0 + 1e-6), 0.5 * gap, 0.5 * spacing_rad)
+    lo = bearing_rad[0] + along - np.roll(reach, 1)
+    hi = bearing_rad[0] + along + reach
+    looked = (length >= 0.0) | np.isneginf(length)
+    length[np.isposinf(length)] = range_max_m
+    sees = looked & (length > 0.0) & (length <= range_max_m)
+    return Sight(virtual_from_sensor, lo[sees], hi[sees], length[sees], lo[looked], hi[looked])
+
+
+def sight_of_cone(*, cone_rad: float, free_m: float, near_m: float, virtual_from_transducer: Pose2) -> Sight:
+    """What a sonar has seen: its cone up to free_m, and near_m all around its front.
+
+    An object nearer than near_m, the least range it can measure, is heard from all directions ahead: the sound is a
+    wave of the transducer's size there, not yet a cone.
+    """
+    half = 0.5 * cone_rad
+    pieces = max(1, math.ceil(cone_rad / _CONE_STEP_RAD))
+    cuts = np.linspace(-half, half, pieces + 1)
+    lo, hi = cuts[:-1], cuts[1:]
+    length = np.full(pieces, free_m)
+    if near_m > 0.0 and half < _FRONT_RAD:
+        side = np.linspace(half, _FRONT_RAD, max(1, math.ceil((_FRONT_RAD - half) / _CONE_STEP_RAD)) + 1)
+        lo = np.concatenate((-side[:0:-1], lo, side[:-1]))
+        hi = np.concatenate((-side[-2::-1], hi, side[1:]))
+        near = np.full(len(side) - 1, near_m)
+        length = np.concatenate((near, np.maximum(length, near_m), near))
+    sees = length > 0.0
+    return Sight(virtual_from_transducer, lo[sees], hi[sees], length[sees], np.array([-half]), np.array([half]))
+
+
+def end_points(bearing_rad: F64, range_m: F64, *, range_min_m: float, virtual_from_sensor: Pose2) -> F64:
+    """(M, 2) obstacles of a fan of beams, virtual sensor frame; what is too close stands at range_min_m."""
+    hit = (np.isfinite(range_m) & (range_m >= 0.0)) | np.isneginf(range_m)
+    r = np.maximum(np.where(np.isneginf(range_m[hit]), range_min_m, range_m[hit]), _LEAST_RANGE_M)
+    a = bearing_rad[hit]
+    return virtual_from_sensor.apply(np.stack((r * np.cos(a), r * np.sin(a)), axis=-1))
+
+
+def arc_of_cone(*, cone_rad: float, range_m: float, virtual_from_transducer: Pose2) -> tuple[F64, F64]:
+    """(M, 2) points along the arc an echo may have come from, and (M,) how far each is off the axis, in radians."""
+    half_steps = max(1, math.ceil(0.5 * cone_rad / _ARC_STEP_RAD))
+    off = np.linspace(-0.5 * cone_rad, 0.5 * cone_rad, 2 * half_steps + 1)
+    r = max(range_m, _LEAST_RANGE_M)
+    return virtual_from_transducer.apply(np.stack((r * np.cos(off), r * np.sin(off)), axis=-1)), np.abs(off)
