@@ -293,10 +293,17 @@ class CanPort:
             raise
         except (can.CanError, OSError, ValueError, ImportError) as error:
             raise self._opening_failed(error) from error
+        self._more_waiting = False
+        self._poll = self._make_poll()
 
     def read(self, timeout_s: float) -> list[tuple[CanFrame, int]]:
         """All frames that wait, each with its arrival time. Raises PortError when the interface is gone or bus-off."""
         frames: list[tuple[CanFrame, int]] = []
+        if self._poll is not None:
+            # python-can's own waiting goes by the wall clock: set back by an hour, it would wait for an hour.
+            if not self._more_waiting:
+                self._poll.poll(timeout_s * 1e3)
+            timeout_s = 0.0
         message = self._receive(timeout_s)
         stamp_ns = self._clock()
         while message is not None:
@@ -309,6 +316,7 @@ class CanPort:
             if len(frames) >= _CAN_BATCH:
                 break
             message = self._receive(0.0)
+        self._more_waiting = message is not None
         return frames
 
     def write(self, item: CanFrame) -> None:
@@ -342,6 +350,15 @@ class CanPort:
             return self._bus.fileno()
         except NotImplementedError:
             return None
+
+    def _make_poll(self) -> select.poll | None:
+        """None for a bus without a descriptor, such as the virtual one."""
+        descriptor = self.fileno()
+        if descriptor is None or descriptor < 0:
+            return None
+        poll = select.poll()
+        poll.register(descriptor, select.POLLIN)
+        return poll
 
     def _open(self, interface: str, channel: str, bitrate_bps: int) -> can.BusABC:
         if interface == "slcan":

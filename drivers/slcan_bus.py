@@ -85,11 +85,12 @@ class LawicelBus(can.BusABC):
     def fileno(self) -> int:
         return self._line.fileno()
 
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame; None after timeout, or sooner if what arrived was no frame. Waits by no clock."""
         if not self._frames:
             for chunk, stamp_ns in self._line.read(1.0 if timeout is None else max(timeout, 0.0)):
                 self._take(chunk, stamp_ns)
-        return (self._frames.popleft(), False) if self._frames else (None, False)
+        return self._frames.popleft() if self._frames else None
 
     def _take(self, chunk: bytes, stamp_ns: int) -> None:
         self._buffer += chunk

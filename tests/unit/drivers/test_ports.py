@@ -1,0 +1,548 @@
+"""Ports on real ptys, TCP on loopback, and python-can buses that exist everywhere."""
+
+from __future__ import annotations
+
+import os
+import socket
+import termios
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from drivers.conversation import CanFrame
+from drivers.errors import PortAbsent, PortBusy, PortDenied, PortError
+from drivers.ports import CanPort, SerialPort, TcpPort, _opening_failed
+from drivers.slcan_bus import LawicelBus, decode_line, encode_line
+
+CLOCK = time.monotonic_ns
+OPENING = b"\r\r\rC\rS8\rO\r"
+
+
+class Pty:
+    """The device's end of a line: `path` is what the program opens."""
+
+    def __init__(self) -> None:
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        self.path = os.ttyname(self.slave)
+
+    def send(self, data: bytes) -> None:
+        os.write(self.master, data)
+
+    def receive(self, count: int) -> bytes:
+        data = b""
+        while len(data) < count:
+            data += os.read(self.master, count - len(data))
+        return data
+
+    def unplug(self) -> None:
+        for descriptor in (self.master, self.slave):
+            with suppress(OSError):
+                os.close(descriptor)
+
+
+@pytest.fixture
+def pty() -> Iterator[Pty]:
+    line = Pty()
+    yield line
+    line.unplug()
+
+
+def read_all(port: SerialPort | TcpPort, count: int) -> bytes:
+    data = b""
+    deadline = time.monotonic() + 5.0
+    while len(data) < count:
+        assert time.monotonic() < deadline
+        data += b"".join(chunk for chunk, _ in port.read(0.1))
+    return data
+
+
+def seconds_until_lost(read: Callable[[float], object]) -> float:
+    started = time.monotonic()
+    with pytest.raises(PortError, match=r"was lost|refuses every frame"):
+        repeat(lambda: read(0.02), 250)
+    return time.monotonic() - started
+
+
+def repeat(action: Callable[[], object], times: int) -> None:
+    for _ in range(times):
+        action()
+
+
+# ---- serial
+
+
+def test_bytes_both_ways_with_their_arrival_time(pty: Pty) -> None:
+    port = SerialPort(pty.path, clock=CLOCK)
+    before = CLOCK()
+    pty.send(b"\x00\x02BM\r\n\xff")
+    [(chunk, stamp_ns)] = port.read(1.0)
+    assert chunk == b"\x00\x02BM\r\n\xff", "raw: nothing translated, nothing echoed"
+    assert before <= stamp_ns <= CLOCK()
+    port.write(b"\x00\r\n\x03\xff")
+    assert pty.receive(5) == b"\x00\r\n\x03\xff"
+    port.close()
+
+
+def test_a_read_returns_as_soon_as_bytes_are_there(pty: Pty) -> None:
+    port = SerialPort(pty.path, clock=CLOCK)
+    delays = []
+    sent: list[int] = []
+
+    def send() -> None:
+        sent.append(CLOCK())
+        pty.send(b"x")
+
+    for _ in range(20):
+        timer = threading.Timer(0.01, send)
+        timer.start()
+        [(_, stamp_ns)] = port.read(1.0)
+        timer.join()
+        delays.append(stamp_ns - sent[-1])
+    assert sorted(delays)[10] < 5_000_000, "median of 20, on a machine that may be busy"
+    port.close()
+
+
+def test_waiting_costs_no_cpu(pty: Pty) -> None:
+    port = SerialPort(pty.path, clock=CLOCK)
+    before = time.thread_time()
+    for _ in range(25):
+        assert port.read(0.02) == []
+    assert time.thread_time() - before < 0.05, "of half a second"
+    port.close()
+
+
+def test_line_speed_is_really_set(pty: Pty) -> None:
+    port = SerialPort(pty.path, baud=19200, clock=CLOCK)
+    assert termios.tcgetattr(pty.slave)[5] == termios.B19200
+    port.set_baud(500000)
+    assert termios.tcgetattr(pty.slave)[5] == termios.B500000
+    port.set_baud(256000)  # not a standard rate
+    port.close()
+
+
+def test_unplugging_is_noticed_at_once(pty: Pty) -> None:
+    port = SerialPort(pty.path, clock=CLOCK)
+    threading.Timer(0.1, pty.unplug).start()
+    assert seconds_until_lost(port.read) < 0.5
+    with pytest.raises(PortError):
+        port.write(b"x")
+    port.close()
+
+
+def test_last_bytes_before_unplugging_are_not_lost(pty: Pty) -> None:
+    """Those that the kernel still has; a pty throws them away when its master closes, so they are read before."""
+    port = SerialPort(pty.path, clock=CLOCK)
+    pty.send(b"last words")
+    assert read_all(port, 10) == b"last words"
+    pty.unplug()
+    assert seconds_until_lost(port.read) < 0.5
+    port.close()
+
+
+def test_a_name_that_leads_elsewhere_is_noticed(pty: Pty, tmp_path: Path) -> None:
+    """A device that comes back as another node: the old line stays silent for ever."""
+    link = tmp_path / "laser"
+    link.symlink_to(pty.path)
+    port = SerialPort(str(link), clock=CLOCK)
+    other = Pty()
+    try:
+        assert port.read(0.25) == []
+        link.unlink()
+        link.symlink_to(other.path)
+        assert seconds_until_lost(port.read) < 0.5
+        link.unlink()
+    finally:
+        port.close()
+        other.unplug()
+
+
+def test_a_name_that_is_gone_is_noticed(pty: Pty, tmp_path: Path) -> None:
+    link = tmp_path / "laser"
+    link.symlink_to(pty.path)
+    port = SerialPort(str(link), clock=CLOCK)
+    link.unlink()
+    assert seconds_until_lost(port.read) < 0.5
+    port.close()
+
+
+def test_absent_port_names_the_repair() -> None:
+    with pytest.raises(PortAbsent, match=r"no /dev/ttyNOWHERE7: is the device plugged in.*umfeld devices list"):
+        SerialPort("/dev/ttyNOWHERE7", clock=CLOCK)
+
+
+def test_second_program_is_told_who_to_stop(pty: Pty) -> None:
+    first = SerialPort(pty.path, clock=CLOCK)
+    with pytest.raises(PortBusy, match=r"another program holds .*fuser"):
+        SerialPort(pty.path, clock=CLOCK)
+    first.close()
+    SerialPort(pty.path, clock=CLOCK).close()
+
+
+def test_denied_port_names_its_group(tmp_path: Path) -> None:
+    """As root everything may be opened, so the error itself is handed in."""
+    node = tmp_path / "ttyACM0"
+    node.touch()
+    error = _opening_failed(str(node), PermissionError(13, "Permission denied"))
+    assert isinstance(error, PortDenied)
+    assert "sudo usermod -aG" in str(error)
+    assert "udev rules" in str(error)
+    gone = _opening_failed("/dev/ttyACM99", PermissionError(13, "Permission denied"))
+    assert "group dialout" in str(gone)
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_not_a_serial_port(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "thing"
+    path.touch() if kind == "file" else path.mkdir()
+    with pytest.raises(PortError, match=r"not a serial port|cannot be opened"):
+        SerialPort(str(path), clock=CLOCK)
+
+
+def test_a_line_that_takes_nothing_fails_in_time(pty: Pty) -> None:
+    port = SerialPort(pty.path, clock=CLOCK, write_timeout_s=0.1)
+    started = time.monotonic()
+    with pytest.raises(PortError, match="takes no bytes"):
+        repeat(lambda: port.write(bytes(4096)), 100)
+    assert time.monotonic() - started < 2.0
+    started = time.monotonic()
+    port.close()
+    assert time.monotonic() - started < 1.0
+
+
+# ---- TCP
+
+
+@pytest.fixture
+def server() -> Iterator[socket.socket]:
+    listener = socket.create_server(("127.0.0.1", 0))
+    yield listener
+    listener.close()
+
+
+def test_tcp_both_ways_and_closed_by_the_device(server: socket.socket) -> None:
+    port = TcpPort("127.0.0.1", server.getsockname()[1], clock=CLOCK)
+    peer, _ = server.accept()
+    peer.sendall(b"hello")
+    assert read_all(port, 5) == b"hello"
+    port.write(b"VV\n")
+    assert peer.recv(10) == b"VV\n"
+    assert port.read(0.01) == []
+    peer.close()
+    with pytest.raises(PortAbsent, match="closed by the device"):
+        port.read(1.0)
+    port.close()
+
+
+def test_tcp_that_nobody_answers() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        number = listener.getsockname()[1]
+    with pytest.raises(PortAbsent, match=f"tcp://127.0.0.1:{number}.*ping"):
+        TcpPort("127.0.0.1", number, clock=CLOCK)
+
+
+def test_tcp_peer_that_reads_nothing(server: socket.socket) -> None:
+    port = TcpPort("127.0.0.1", server.getsockname()[1], clock=CLOCK, write_timeout_s=0.1)
+    peer, _ = server.accept()
+    with pytest.raises(PortError):
+        repeat(lambda: port.write(bytes(65536)), 1000)
+    peer.close()
+    port.close()
+
+
+# ---- slcan
+
+
+@pytest.mark.parametrize(
+    ("line", "frame"),
+    [
+        (b"t1233010203", CanFrame(0x123, b"\1\2\3")),
+        (b"t7FF0", CanFrame(0x7FF)),
+        (b"T1ABCDEF080001020304050607", CanFrame(0x1ABCDEF0, bytes(range(8)), extended=True)),
+        (b"r3214", CanFrame(0x321, remote=True, dlc=4)),
+        (b"R000003212", CanFrame(0x321, extended=True, remote=True, dlc=2)),
+    ],
+)
+def test_lines_both_ways(line: bytes, frame: CanFrame) -> None:
+    assert decode_line(line) == frame
+    assert decode_line(line + b"EA5F") == frame, "with the adapter's time stamp"
+    dlc = frame.dlc if frame.dlc is not None else len(frame.data)
+    assert encode_line(frame.can_id, frame.data, frame.extended, frame.remote, dlc) == line + b"\r"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [b"t", b"t12", b"t1239", b"t123201", b"t12320102 ", b"t1232010G", b"t8001FF", b"T200000000", b"t+121FF", b"x1230",
+     b"t1_2101", b"t12310", b"r32141", b"V1013", b"t123101020", "t123\u0661".encode()],
+)  # fmt: skip
+def test_damaged_lines_are_no_frames(line: bytes) -> None:
+    assert decode_line(line) is None
+
+
+def read_frames(port: CanPort, count: int) -> list[CanFrame]:
+    frames: list[CanFrame] = []
+    deadline = time.monotonic() + 5.0
+    while len(frames) < count:
+        assert time.monotonic() < deadline, frames
+        frames += [frame for frame, _ in port.read(0.1)]
+    return frames
+
+
+def test_slcan_opens_the_adapter_from_any_state_and_closes_it(pty: Pty) -> None:
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    assert pty.receive(len(OPENING)) == OPENING
+    port.write(CanFrame(0x601, b"\x40\x00\x10\x00"))
+    assert pty.receive(14) == b"t601440001000\r"
+    port.close()
+    assert pty.receive(2) == b"C\r"
+
+
+def test_slcan_bitrates(pty: Pty) -> None:
+    port = CanPort(interface="slcan", channel=pty.path + "@57600", bitrate_bps=250_000, clock=CLOCK)
+    assert b"S5\r" in pty.receive(len(OPENING))
+    port.close()
+    with pytest.raises(PortError, match="300000 bit/s: choose one of"):
+        CanPort(interface="slcan", channel=pty.path, bitrate_bps=300_000, clock=CLOCK)
+
+
+def test_slcan_frames_in_any_pieces(pty: Pty) -> None:
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    stream = b"0203\r\rz\rt2A1401020304\r\aT0000012320A0B\rV1013\rt2A1zz\rr1230\r"
+    frames: list[CanFrame] = []
+    for byte in stream:
+        pty.send(bytes((byte,)))
+        frames += [frame for frame, _ in port.read(0.02)]
+    expected = [
+        CanFrame(0x2A1, b"\1\2\3\4"),
+        CanFrame(0x123, b"\x0a\x0b", extended=True),
+        CanFrame(0x123, remote=True, dlc=0),
+    ]
+    assert frames == expected
+    assert port.drops == {"slcan_malformed": 2, "slcan_refused": 1}
+    pty.send(stream)
+    assert read_frames(port, 3) == expected
+    port.close()
+
+
+def test_slcan_burst_keeps_all_and_their_order(pty: Pty) -> None:
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    numbers = iter(range(1000))
+    sender = threading.Thread(target=repeat, args=(lambda: pty.send(b"t%03X20102\r" % next(numbers)), 1000))
+    sender.start()
+    assert [frame.can_id for frame in read_frames(port, 1000)] == list(range(1000))
+    sender.join()
+    port.close()
+
+
+def test_slcan_endless_line_needs_no_memory(pty: Pty) -> None:
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    for _ in range(10):
+        pty.send(b"t" * 1000)
+        port.read(0.05)
+    assert port.drops["slcan_malformed"] > 0
+    pty.send(b"\rt1230\r")
+    assert read_frames(port, 1) == [CanFrame(0x123)]
+    port.close()
+
+
+def test_slcan_adapter_that_refuses_everything_is_reopened(pty: Pty) -> None:
+    """It was without power for a moment: still there, but closed."""
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    pty.send(b"\a" * 7)
+    assert port.read(0.1) == []
+    pty.send(b"\rt1230\r\a")
+    assert len(read_frames(port, 1)) == 1, "a frame between them: it is alive"
+    pty.send(b"\a" * 8)
+    assert seconds_until_lost(port.read) < 0.5
+    port.close()
+
+
+def test_slcan_unplugged_is_noticed_in_time(pty: Pty) -> None:
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    threading.Timer(0.1, pty.unplug).start()
+    assert seconds_until_lost(port.read) < 0.5
+    port.close()
+
+
+def test_slcan_replugged_gets_the_whole_opening_sequence(pty: Pty, tmp_path: Path) -> None:
+    link = tmp_path / "can"
+    link.symlink_to(pty.path)
+    first = CanPort(interface="slcan", channel=str(link), clock=CLOCK)
+    pty.receive(len(OPENING))
+    pty.unplug()
+    assert seconds_until_lost(first.read) < 0.5
+    first.close()
+    link.unlink()
+    with pytest.raises(PortAbsent):
+        CanPort(interface="slcan", channel=str(link), clock=CLOCK)
+    again = Pty()
+    link.symlink_to(again.path)
+    second = CanPort(interface="slcan", channel=str(link), clock=CLOCK)
+    assert again.receive(len(OPENING)) == OPENING
+    second.close()
+    again.unplug()
+
+
+def test_slcan_understands_python_cans_own_client_and_the_other_way() -> None:
+    """Both ends of a wire: our bus here, python-can's slcan there, a relay between."""
+    ours, theirs = Pty(), Pty()
+    bus = LawicelBus(ours.path, bitrate_bps=1_000_000, clock=CLOCK)
+    other = can.Bus(interface="slcan", channel=theirs.path, bitrate=1_000_000, sleep_after_open=0, ignore_config=True)
+    try:
+        ours.receive(len(OPENING))
+        os.set_blocking(theirs.master, False)
+        os.read(theirs.master, 4096)
+        sent = [
+            can.Message(arbitration_id=0x123, data=b"\1\2", is_extended_id=False),
+            can.Message(arbitration_id=0x1ABCDEF0, data=bytes(range(8))),
+            can.Message(arbitration_id=0x321, is_remote_frame=True, dlc=4, is_extended_id=False),
+        ]
+        for message in sent:
+            other.send(message)
+            ours.send(os.read(theirs.master, 4096))
+            assert _same(bus.recv(1.0), message)
+            bus.send(message)
+            theirs.send(os.read(ours.master, 4096))
+            assert _same(other.recv(1.0), message)
+    finally:
+        bus.shutdown()
+        other.shutdown()
+        ours.unplug()
+        theirs.unplug()
+
+
+def _same(got: can.Message | None, sent: can.Message) -> bool:
+    return got is not None and got.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False)
+
+
+# ---- python-can's other buses
+
+
+def test_a_batch_left_over_is_read_without_waiting(pty: Pty) -> None:
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    pty.send(b"t1230\r" * 600)
+    sizes: list[int] = []
+    started = time.monotonic()
+    while sum(sizes) < 600:
+        sizes.append(len(port.read(2.0)))
+    assert time.monotonic() - started < 1.5
+    assert max(sizes) == 256
+    port.close()
+
+
+def test_a_wall_clock_set_back_does_not_stop_a_read(pty: Pty, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    hours = iter(range(1_000_000, 0, -3600))
+    monkeypatch.setattr(can.bus, "time", lambda: float(next(hours)))
+    started = time.monotonic()
+    assert port.read(0.05) == []
+    assert time.monotonic() - started < 1.0
+    port.close()
+
+
+def test_virtual_bus_both_ways() -> None:
+    one, two = (CanPort(interface="virtual", channel="ports-test", clock=CLOCK) for _ in range(2))
+    frames = [CanFrame(0x80), CanFrame(0x1ABCDEF0, b"\1", extended=True), CanFrame(0x12, remote=True, dlc=3)]
+    for frame in frames:
+        one.write(frame)
+    assert read_frames(two, 3) == frames
+    assert one.read(0.01) == [], "nobody hears himself"
+    one.close()
+    two.close()
+
+
+def test_socketcan_that_is_not_there_names_the_repair() -> None:
+    with pytest.raises(PortError, match=r"ip link set canX9 up type can bitrate 500000"):
+        CanPort(channel="canX9", bitrate_bps=500_000, clock=CLOCK)
+
+
+class FakeBus:
+    """Stands for a SocketCAN interface, which this machine may not have."""
+
+    def __init__(self) -> None:
+        self.messages: list[can.Message] = []
+        self.recv_error: Exception | None = None
+        self.send_error: Exception | None = None
+
+    def recv(self, timeout: float) -> can.Message | None:
+        if self.recv_error is not None:
+            raise self.recv_error
+        return self.messages.pop(0) if self.messages else None
+
+    def send(self, message: can.Message, timeout: float) -> None:
+        if self.send_error is not None:
+            raise self.send_error
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        raise OSError("already gone")
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> FakeBus:
+    bus = FakeBus()
+
+    def open_bus(**options: Any) -> FakeBus:
+        assert options["interface"] == "socketcan"
+        assert "bitrate" not in options, "SocketCAN's is set by `ip link`"
+        return bus
+
+    monkeypatch.setattr(can, "Bus", open_bus)
+    return bus
+
+
+def error_frame(bits: int) -> can.Message:
+    return can.Message(arbitration_id=bits, is_error_frame=True, data=bytes(8))
+
+
+def test_bus_off_gives_the_port_up(fake: FakeBus) -> None:
+    port = CanPort(channel="can0", clock=CLOCK)
+    fake.messages = [error_frame(0x04), can.Message(arbitration_id=5, is_extended_id=False)]
+    assert [frame for frame, _ in port.read(0.0)] == [CanFrame(5)]
+    assert port.drops == {"bus_error": 1}
+    fake.messages = [error_frame(0x40)]
+    with pytest.raises(PortError, match=r"bus-off.*termination.*restart-ms"):
+        port.read(0.0)
+    port.close()
+
+
+def test_interface_going_down_gives_the_port_up(fake: FakeBus) -> None:
+    port = CanPort(channel="can0", clock=CLOCK)
+    fake.recv_error = can.CanOperationError("Network is down", 100)
+    with pytest.raises(PortError, match="ip link set can0 up"):
+        port.read(0.0)
+    fake.send_error = OSError(100, "Network is down")
+    with pytest.raises(PortError):
+        port.write(CanFrame(0x80))
+    port.close()
+
+
+def test_a_full_transmit_queue_loses_frames_but_not_the_port(fake: FakeBus) -> None:
+    port = CanPort(channel="can0", clock=CLOCK)
+    fake.send_error = can.CanOperationError("Failed to transmit: No buffer space available", 105)
+    port.write(CanFrame(0x80))
+    port.write(CanFrame(0x80))
+    assert port.drops == {"tx_full": 2}
+    port.close()
+
+
+def test_fd_frames_are_counted_and_left_out(fake: FakeBus) -> None:
+    port = CanPort(channel="can0", clock=CLOCK)
+    fake.messages = [can.Message(arbitration_id=5, is_fd=True, data=bytes(12)), can.Message(arbitration_id=6)]
+    assert [frame.can_id for frame, _ in port.read(0.0)] == [6]
+    assert port.drops == {"fd_frame": 1}
+
+
+def test_a_flood_leaves_the_asking_its_turn(fake: FakeBus) -> None:
+    port = CanPort(channel="can0", clock=CLOCK)
+    fake.messages = [can.Message(arbitration_id=5) for _ in range(1000)]
+    assert len(port.read(0.0)) == 256
