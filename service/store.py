@@ -597,18 +597,28 @@ def _explained(path: Path) -> Iterator[None]:
         raise StoreTrouble(f"{path}: cannot be read: {error}; load a generation ({path.name}.1)") from error
 
 
-def write_occupancy_map(patch: GridPatch, path: Path, *, source: str, tile_cells: int = 128) -> Receipt:
-    """A new map file with nothing but a grid, for instance one that another program made; replaces path whole."""
+def write_occupancy_map(
+    patch: GridPatch,
+    path: Path,
+    *,
+    source: str,
+    tile_cells: int = 128,
+    layers: Mapping[str, Iterable[Tile]] | None = None,
+    meta: Mapping[str, Any] | None = None,
+) -> Receipt:
+    """A new map file made from a finished grid; replaces path whole.
+
+    source: where the grid came from, in words.  layers, meta: more to put into the same snapshot, for instance the
+    tiles from which a daemon restores its own grid.
+    """
+    properties = {"resolution_m": patch.resolution_m, "tile_cells": tile_cells}
     with replacing(path) as temporary:
         temporary.unlink()
         try:
             with MapStore.open(temporary, wall_ns=time.time_ns) as store:
                 store.snapshot(
-                    {OCCUPANCY: occupancy_tiles(patch, tile_cells)},
-                    {
-                        OCCUPANCY: {"resolution_m": patch.resolution_m, "tile_cells": tile_cells},
-                        "imported_from": source,
-                    },
+                    {**(layers or {}), OCCUPANCY: occupancy_tiles(patch, tile_cells)},
+                    {**(meta or {}), OCCUPANCY: properties, "made_from": source},
                 )
         finally:
             temporary.with_name(temporary.name + ".lock").unlink(missing_ok=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,14 @@ if TYPE_CHECKING:
     from service.zenoh_session import Client
 
 app = typer.Typer()
+
+
+class Model(StrEnum):
+    """How a grid's cells count."""
+
+    COUNTERS = "counters"
+    LOG_ODDS = "log-odds"
+
 
 Connect = Annotated[str | None, typer.Option(help="The daemon's endpoint; default: that of the configuration.")]
 Config = Annotated[Path | None, typer.Option("--config", "-c", help="The daemon's configuration file.")]
@@ -165,15 +174,18 @@ def import_map(
     out: Annotated[Path, typer.Argument(help="The map file to make, NAME.umfeld.")],
     *,
     resolution: Annotated[float | None, typer.Option(help="Cells of this many metres; default: the picture's.")] = None,
+    model: Annotated[Model, typer.Option(help="As in [grid] of the daemon that shall load it.")] = Model.COUNTERS,
     force: Annotated[bool, typer.Option(help="Replace the file if it is there.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a map file from a grid of another program; turned origins and any size are fine.
 
+    Beside the daemon's own map file it can be loaded by name: `umfeld map load floor1`.
+
     Example: umfeld map import floor1.yaml floor1.umfeld
     """
     from service.export import load_pgm_yaml, patch_of
-    from service.store import write_occupancy_map
+    from service.map_import import write_imported_map
 
     if out.suffix != ".umfeld":
         raise WrongUsage(f"{out}: a map file ends with .umfeld")
@@ -182,7 +194,7 @@ def import_map(
     if resolution is not None and not 0.001 <= resolution <= 10.0:
         raise WrongUsage(f"--resolution {resolution}: metres a cell, from 0.001 to 10")
     patch = patch_of(load_pgm_yaml(source), resolution)
-    receipt = write_occupancy_map(patch, out, source=str(source.name))
+    receipt = write_imported_map(patch, out, source=source.name, model=model.value)
     _report(receipt.document(), as_json)
 
 

@@ -1,0 +1,47 @@
+"""A grid that another program made, as a map file that the daemon can load and go on with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from mapping.grids.occupancy import OccupancyGrid
+from mapping.grids.patch import GridPatch
+from mapping.grids.tiles import TILE
+from service.export import FREE_THRESHOLD, OCCUPIED_THRESHOLD, MapFileTrouble
+from service.files import Receipt
+from service.store import write_occupancy_map
+
+_OBSERVATIONS = 4
+"""Each cell counts as seen this often: sure enough to be occupied or free, and soon overruled by what a robot sees."""
+
+
+def write_imported_map(patch: GridPatch, path: Path, *, source: str, model: Literal["counters", "log-odds"]) -> Receipt:
+    """Write patch as a map file. model: that of the grid which shall load it ([grid] model)."""
+    grid = OccupancyGrid(resolution_m=patch.resolution_m, model=model, max_tiles=tiles_needed(patch))
+    corner = (patch.row0, patch.col0)
+    occupied = np.argwhere(patch.cells >= 100 * OCCUPIED_THRESHOLD) + corner
+    free = np.argwhere((patch.cells >= 0) & (patch.cells < 100 * FREE_THRESHOLD)) + corner
+    if len(occupied) + len(free) == 0:
+        raise MapFileTrouble(f"{source}: no cell of it is occupied or free; are its thresholds right?")
+    try:
+        for _ in range(_OBSERVATIONS):
+            grid.insert_cells(occupied, free)
+    except ValueError as error:
+        raise MapFileTrouble(f"{source}: {error}; move its origin nearer to the map's") from error
+    if grid.refused_tiles:
+        raise MapFileTrouble(f"{source}: is too large for one map; cut it or use a coarser --resolution")
+    properties = {"resolution_m": patch.resolution_m, "model": model, "tile_cells": TILE}
+    return write_occupancy_map(
+        grid.patch(), path, source=source, tile_cells=TILE, layers={"grid": grid.tiles()}, meta={"grid": properties}
+    )
+
+
+def tiles_needed(patch: GridPatch) -> int:
+    """Tiles that a patch touches; at least 1."""
+    rows, columns = patch.cells.shape
+    height = (patch.row0 + rows - 1) // TILE - patch.row0 // TILE + 1
+    width = (patch.col0 + columns - 1) // TILE - patch.col0 // TILE + 1
+    return max(1, int(height * width))
