@@ -6,27 +6,36 @@ Drivers are imported when a configuration names them, so that a robot without a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from drivers.conversation import Conversation
 from drivers.ports import Clock, Port, Tap
 from drivers.reader import Sink, WireReader
+from drivers.readings import ChainReading, RangeReading, RangeStatus, Reading, ScanReading, WheelReading
 from mapping.frames import Pose2
+from mapping.odometry import DriveGeometry
 from service.config import (
     CanBus,
     Cia406Wheels,
     Config,
     Device,
+    Drive,
     HokuyoLaser,
     Mount,
     PlanePose,
     UsBoardSerialSonars,
     UsBoardSonars,
 )
+from service.fusion import Fusion, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer
 from service.sensors import Chain, Laser, Sensor, Transducer, Wheels
+
+if TYPE_CHECKING:
+    from service.layers import BuildingLayer
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,3 +181,153 @@ def _sensor_of(source: str, device: Device) -> Sensor:
             return Wheels(source)
         case _:
             raise TypeError(f"no sensor for {type(device).__name__}")
+
+
+# --- maps -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Maps:
+    """The maps of a configuration. building: the one the store keeps, None if there is none."""
+
+    sectors: tuple[SectorLayer, ...]
+    grids: tuple[GridLayer, ...]
+    building: BuildingLayer | None
+
+
+def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
+    """Empty maps as configured, fed by the sensors found."""
+    from mapping.grids.occupancy import OccupancyGrid
+    from mapping.grids.rolling import RollingGrid
+    from service.layers import BuildingLayer, RollingLayer
+
+    building = None
+    grids: list[GridLayer] = []
+    if config.grid.enabled:
+        building = BuildingLayer(
+            OccupancyGrid(resolution_m=config.grid.resolution_m, model=config.grid.model),
+            _sources(config, config.grid.sources, found),
+            publish_period_ns=round(config.grid.publish_period_s * 1e9),
+            update_period_ns=round(config.grid.update_period_s * 1e9),
+        )
+        grids.append(building)
+    if config.local_grid.enabled:
+        local = config.local_grid
+        grids.append(
+            RollingLayer(
+                "local",
+                RollingGrid(side_m=local.size_m, resolution_m=local.resolution_m, model=local.model),
+                _sources(config, local.sources, found),
+                period_ns=round(local.period_s * 1e9),
+            )
+        )
+    return Maps(tuple(_sector_maps(config)), tuple(grids), building)
+
+
+def _sector_maps(config: Config) -> Iterator[SectorLayer]:
+    from mapping.sectors.polar import PolarSectors
+    from mapping.sectors.rectangular import RectSectors
+    from service.layers import PolarLayer, RectLayer
+
+    footprint = np.array(config.robot.footprint_m)
+    for name, polar in sorted(config.sectors.polar.items()):
+        fed_by = _in_order(config, polar.sources)
+        yield PolarLayer(
+            name,
+            PolarSectors(
+                sources=fed_by,
+                start_rad=math.radians(polar.start_deg),
+                stop_rad=math.radians(polar.stop_deg),
+                sector_rad=math.radians(polar.sector_deg),
+                base_from_sensor=pose_of(polar.pose),
+                footprint=footprint,
+                range_max_m=math.inf if polar.range_max_m is None else polar.range_max_m,
+            ),
+            fed_by,
+        )
+    for name, rect in sorted(config.sectors.rect.items()):
+        fed_by = _in_order(config, rect.sources)
+        yield RectLayer(
+            name,
+            RectSectors(
+                sources=fed_by,
+                size_m=rect.size_m,
+                sector_m=rect.sector_m,
+                base_from_sensor=pose_of(rect.pose),
+                footprint=footprint,
+            ),
+            fed_by,
+        )
+
+
+def _in_order(config: Config, references: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(config.source_name(*config.resolve(reference)) for reference in references))
+
+
+def parts(config: Config, found: Mapping[str, Sensor], made: Maps, localiser: Localiser) -> Parts:
+    """What fusion is made of."""
+    drive = None
+    if config.drive.source is not None:
+        drive = (config.source_name("wheels", config.drive.source), geometry_of(config.drive))
+    return Parts(
+        sensors=found,
+        sectors=made.sectors,
+        grids=made.grids,
+        drive=drive,
+        max_wheel_speed_m_s=config.drive.max_wheel_speed_m_s,
+        localiser=localiser,
+        wait_ns=config.alignment.odometry_wait_ms * 1_000_000,
+        odometry_memory_s=config.alignment.odometry_memory_s,
+    )
+
+
+def geometry_of(drive: Drive) -> DriveGeometry:
+    """How counts become motion."""
+    return DriveGeometry(
+        wheel_radius_left_m=drive.wheel_radius_left_m,
+        wheel_radius_right_m=drive.wheel_radius_right_m,
+        track_width_m=drive.track_width_m,
+        ticks_per_turn_left=drive.ticks_per_turn_left,
+        ticks_per_turn_right=drive.ticks_per_turn_right,
+        travel_noise_m_per_sqrt_m=drive.travel_noise_m_per_sqrt_m,
+        unknown_speed_m_s=drive.unknown_speed_m_s,
+        unknown_turn_rad_s=drive.unknown_turn_rad_s,
+    )
+
+
+def _sources(config: Config, references: Sequence[str] | None, found: Mapping[str, Sensor]) -> frozenset[str]:
+    if references is None:
+        return frozenset(name for name, sensor in found.items() if isinstance(sensor, Laser | Chain))
+    return frozenset(config.source_name(*config.resolve(reference)) for reference in references)
+
+
+# --- warming up -------------------------------------------------------------------------------------------------------
+
+
+def warm_up(config: Config) -> None:
+    """Load or compile every kernel this configuration uses, on maps that are thrown away."""
+    found = sensors(config)
+    fusion = Fusion(parts(config, found, maps(config, found), OdometryOnly()))
+    now_ns = 0
+    for step in range(4):  # standing, then moving: the two take different kernels
+        now_ns += 100_000_000
+        for name, sensor in found.items():
+            fusion.on_item(name, _pretended(sensor, step, now_ns), now_ns)
+        for name, sensor in found.items():
+            if isinstance(sensor, Wheels):
+                fusion.on_item(name, WheelReading(now_ns + 50_000_000, 100 * step, -100 * step, True), now_ns)
+        fusion.tick(now_ns + 60_000_000)
+
+
+def _pretended(sensor: Sensor, step: int, now_ns: int) -> Reading:
+    match sensor:
+        case Laser():
+            bearing = np.linspace(-2.0, 2.0, 64)
+            distance = np.full(64, 2.0)
+            distance[:3] = (np.inf, -np.inf, np.nan)
+            return ScanReading(now_ns, 100_000.0 * (step % 2), 100_000_000, bearing, distance, 0.05, 10.0)
+        case Chain():
+            ranges = tuple(RangeReading(each.channel, 1.0, RangeStatus.ECHO) for each in sensor.transducers)
+            return ChainReading(now_ns, ranges)
+        case Wheels():
+            return WheelReading(now_ns, 100 * step, 100 * step, True)

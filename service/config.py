@@ -284,6 +284,7 @@ class PolarSectorMap(Section):
     sector_deg: float = Field(default=5.0, gt=0, le=180, description="Width of a sector.")
     start_deg: float = Field(default=-120.0, ge=-360, le=360, description="Where the first sector begins.")
     stop_deg: float = Field(default=120.0, ge=-360, le=360, description="Where the last one ends.")
+    range_max_m: Positive | None = Field(default=None, description="What lies farther does not count; default: all.")
     pose: PlanePose = Field(default=PlanePose(), description="The virtual sensor in the base frame.")
 
     @model_validator(mode="after")
@@ -343,6 +344,7 @@ class LocalGrid(Section):
 
     enabled: bool = Field(default=False, description="Keep it.")
     size_m: float = Field(default=8.0, gt=0, le=200, description="Edge of the square it covers.")
+    period_s: float = Field(default=0.2, ge=0.05, le=10, description="Shortest time between two that are published.")
     resolution_m: float = Field(default=0.05, ge=0.005, le=1.0, description="Edge of a cell.")
     model: Literal["counters", "log-odds"] = Field(default="counters", description="What a cell remembers.")
     sources: tuple[Reference, ...] | None = Field(default=None, description="Sensors that draw it; default: all.")
@@ -607,6 +609,7 @@ def _cross_faults(config: Config, data: Mapping[str, Any]) -> list[Fault]:
     Looked for in the raw tables, where tables that are faulty otherwise still stand: one fault does not hide another.
     """
     return [
+        *_name_faults(data),
         *_reference_faults(data),
         *_port_faults(data),
         *_can_id_faults(config),
@@ -633,6 +636,12 @@ def _missing(path: KeyPath, name: str, section: str, data: Mapping[str, Any]) ->
     there = ", ".join(sorted(_table(data, *section.split("."))))
     repair = f"add [{section}.{name}], or name one of: {there}" if there else f"add [{section}.{name}]"
     return Fault(path, f"there is no [{section}.{name}]; {repair}")
+
+
+def _name_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
+    for section in DEVICE_SECTIONS:
+        if "json" in _table(data, section):
+            yield Fault((section, "json"), "the name json is taken by the key health/json; take another name")
 
 
 def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:

@@ -11,6 +11,7 @@ Input never stops fusion. What cannot be used is dropped and counted by source a
     wrong_count, no_beams, too_many_beams, bearing_not_finite, times_wrong, limits_wrong    a scan that is none
     range_out_of_bounds    single beams: not positive, or beyond the device's limit; taken as INVALID
     odometry_late, odometry_gone, odometry_broken, waiting_full    a scan that no pose belongs to, for the grids only
+    map_refused    a place or a length that a grid cannot hold
     too_fast    wheel counts that no wheel can have made
     unknown_channel, not_configured, wrong_kind    a reading from nowhere
 """
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.readings import ChainReading, DeviceEvent, LinkState, RangeStatus, Reading, ScanReading, WheelReading
-from mapping.deskew import Deskewed, deskew
+from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
 from mapping.odometry import DifferentialOdometry, DriveGeometry, OdometryState
 from mapping.pose_buffer import GoneError, PoseBuffer
@@ -49,8 +50,9 @@ _STALE_LIMIT_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class Cone:
-    """What one sonar heard. range_m: +inf nothing up to range_max_m, -inf too close, NaN nothing known."""
+    """What one sonar heard. range_m: +inf nothing up to range_max_m, -inf too close, NaN invalid or another's echo."""
 
+    channel: int
     base_from_transducer: Pose2
     range_m: float
 
@@ -73,13 +75,13 @@ class SectorLayer(Protocol):
     def sources(self) -> frozenset[str]:
         """Names of the sensors that feed it."""
 
-    def take_scan(self, source: str, scan: Scan, base_from_sensor: Pose2, stale_after_ns: int) -> None:
-        """Replace what this source said. base_from_sensor: at the scan's stamp, seen from the base now."""
+    def take_scan(self, source: str, scan: Scan, base_from_sensor: Pose2) -> None:
+        """Replace what this source said. base_from_sensor: seen from where the base is now."""
 
-    def take_round(self, source: str, heard: Round, stale_after_ns: int) -> None:
+    def take_round(self, source: str, heard: Round) -> None:
         """The same for sonars; directions that are not in this round keep what they had."""
 
-    def lose(self, source: str, now_ns: int) -> None:
+    def lose(self, source: str) -> None:
         """The source is gone: what it said is stale from now on."""
 
     def output(self, now_ns: int) -> PolarOut | RectOut:
@@ -93,10 +95,10 @@ class GridLayer(Protocol):
     def sources(self) -> frozenset[str]:
         """Names of the sensors that draw it."""
 
-    def take_scan(self, scan: Scan, map_from_sensor: Pose2) -> None:
-        """Insert one de-skewed sweep."""
+    def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
+        """Insert one sweep. map_from_sensor: x, y, yaw of every beam's sensor pose (N, 3), or one for all (3,)."""
 
-    def take_round(self, heard: Round, map_from_base: Pose2) -> None:
+    def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
         """Insert the cones of one round."""
 
     def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
@@ -109,7 +111,7 @@ class Localiser(Protocol):
     def take_odometry(self, state: OdometryState) -> None:
         """Each new state, in order."""
 
-    def take_scan(self, sensor: str, swept: Deskewed, base_from_sensor: Pose2) -> None:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> None:
         """Each sweep that odometry covers, in order of stamps, before it is put into the grids."""
 
     def map_from_odom(self) -> tuple[Pose2, F64]:
@@ -125,7 +127,7 @@ class OdometryOnly:
     def take_odometry(self, state: OdometryState) -> None:
         """Nothing to learn from it."""
 
-    def take_scan(self, sensor: str, swept: Deskewed, base_from_sensor: Pose2) -> None:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> None:
         """Nothing to learn from it."""
 
     def map_from_odom(self) -> tuple[Pose2, F64]:
@@ -168,6 +170,7 @@ class Fusion:
         self._broken = False
         self._state: OdometryState | None = None
         self._pose_told_ns: int | None = None
+        self._fresh_until_ns: dict[str, int] = {}
         self._sectors_told_ns: dict[int, int] = {}
         self._sector_states: dict[int, bytes] = {}
         self._newest_stamp_ns = 0
@@ -196,6 +199,8 @@ class Fusion:
 
     def tick(self, now_ns: int) -> list[Output]:
         """To be called every TICK_PERIOD_NS: ages sectors, ends waiting, publishes grids that are due."""
+        for source in [name for name, until_ns in self._fresh_until_ns.items() if now_ns > until_ns]:
+            self._lose(source)
         outputs: list[Output] = []
         for index, layer in enumerate(self._parts.sectors):
             output = layer.output(now_ns)
@@ -233,12 +238,19 @@ class Fusion:
             return []
         if event.state is LinkState.STARTING and source in self._chains:
             self._chains[source].forget()
-        outputs: list[Output] = []
-        for index, layer in enumerate(self._parts.sectors):
+        self._lose(source)
+        return [
+            self._told(index, layer.output(now_ns), now_ns)
+            for index, layer in enumerate(self._parts.sectors)
+            if source in layer.sources
+        ]
+
+    def _lose(self, source: str) -> None:
+        """Nothing of what it said is fresh any more."""
+        self._fresh_until_ns.pop(source, None)
+        for layer in self._parts.sectors:
             if source in layer.sources:
-                layer.lose(source, now_ns)
-                outputs.append(self._told(index, layer.output(now_ns), now_ns))
-        return outputs
+                layer.lose(source)
 
     # --- lasers
 
@@ -247,12 +259,13 @@ class Fusion:
         if scan is None:
             return []
         outputs: list[Output] = [ScanOut(laser.name, scan, laser.base_from_sensor, laser.height_m)]
-        limit_ns = stale_after_ns(reading.scan_period_ns, _last_beam_ns(scan) - scan.stamp_ns)
+        sweep_ns = _last_beam_ns(scan) - scan.stamp_ns
+        self._fresh_until_ns[laser.name] = scan.stamp_ns + stale_after_ns(reading.scan_period_ns, sweep_ns)
         fed = [(index, layer) for index, layer in enumerate(self._parts.sectors) if laser.name in layer.sources]
         if fed:
             seen, base_from_sensor = self._as_seen_now(scan, laser.base_from_sensor)
             for index, layer in fed:
-                layer.take_scan(laser.name, seen, base_from_sensor, limit_ns)
+                layer.take_scan(laser.name, seen, base_from_sensor)
                 outputs.append(self._told(index, layer.output(now_ns), now_ns))
         self._newest_stamp_ns = max(self._newest_stamp_ns, scan.stamp_ns)
         self._draw_when_covered(laser.name, scan, scan.stamp_ns, _last_beam_ns(scan), now_ns)
@@ -287,7 +300,8 @@ class Fusion:
             swept = deskew(scan, _HeldPoses(self._poses), base_from_sensor)
         except GoneError:
             return scan, base_from_sensor
-        return swept.scan, self._state.odom_from_base.inverse() @ swept.odom_from_sensor
+        seen = replace(swept.scan, stamp_ns=scan.stamp_ns)  # ages count from the first beam
+        return seen, self._state.odom_from_base.inverse() @ swept.odom_from_sensor
 
     # --- sonars
 
@@ -301,10 +315,11 @@ class Fusion:
         if not cones:
             return []
         heard = Round(reading.stamp_ns, cones, chain.cone_rad, chain.range_min_m, chain.range_max_m)
+        self._fresh_until_ns[chain.name] = reading.stamp_ns + memory.stale_after_ns
         outputs: list[Output] = [memory.output(reading.stamp_ns)]
         for index, layer in enumerate(self._parts.sectors):
             if chain.name in layer.sources:
-                layer.take_round(chain.name, heard, memory.stale_after_ns)
+                layer.take_round(chain.name, heard)
                 outputs.append(self._told(index, layer.output(now_ns), now_ns))
         self._newest_stamp_ns = max(self._newest_stamp_ns, reading.stamp_ns)
         self._draw_when_covered(chain.name, heard, reading.stamp_ns, reading.stamp_ns, now_ns)
@@ -396,34 +411,45 @@ class Fusion:
 
     def _draw_moving(self, source: str, value: Scan | Round) -> None:
         """Raises GoneError if the track is broken under the sweep."""
+        localiser = self._parts.localiser
         if isinstance(value, Round):
             odom_from_base = self._poses.at(value.stamp_ns)
-            self._insert_round(source, value, self._parts.localiser.map_from_odom()[0] @ odom_from_base)
+            self._insert_round(source, value, localiser.map_from_odom()[0] @ odom_from_base)
             return
-        laser = self._parts.sensors[source]
-        assert isinstance(laser, Laser)
-        swept = deskew(value, self._poses, laser.base_from_sensor)
-        self._parts.localiser.take_scan(source, swept, laser.base_from_sensor)
-        self._insert_scan(source, swept.scan, self._parts.localiser.map_from_odom()[0] @ swept.odom_from_sensor)
+        base_from_sensor = self._laser(source).base_from_sensor
+        odom_from_bases = self._poses.at_many(beam_stamps(value))
+        localiser.take_scan(source, value, self._poses, base_from_sensor)
+        map_from_base = compose_many(localiser.map_from_odom()[0], odom_from_bases)
+        self._insert_sweep(source, value, carry(map_from_base, base_from_sensor))
 
     def _draw_standing(self, source: str, value: Scan | Round) -> None:
         map_from_base, _ = self._parts.localiser.map_from_odom()
         if isinstance(value, Round):
             self._insert_round(source, value, map_from_base)
             return
+        pose = map_from_base @ self._laser(source).base_from_sensor
+        self._insert_sweep(source, value, np.array([pose.x_m, pose.y_m, pose.yaw_rad]))
+
+    def _laser(self, source: str) -> Laser:
         laser = self._parts.sensors[source]
         assert isinstance(laser, Laser)
-        self._insert_scan(source, value, map_from_base @ laser.base_from_sensor)
+        return laser
 
-    def _insert_scan(self, source: str, scan: Scan, map_from_sensor: Pose2) -> None:
+    def _insert_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
         for grid in self._parts.grids:
             if source in grid.sources:
-                grid.take_scan(scan, map_from_sensor)
+                try:
+                    grid.take_sweep(source, scan, map_from_sensor)
+                except ValueError:  # farther or longer than a grid can hold
+                    self._drop(source, "map_refused")
 
     def _insert_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
         for grid in self._parts.grids:
             if source in grid.sources:
-                grid.take_round(heard, map_from_base)
+                try:
+                    grid.take_round(source, heard, map_from_base)
+                except ValueError:
+                    self._drop(source, "map_refused")
 
     # --- small things
 
@@ -481,7 +507,7 @@ class _ChainMemory:
         return stale_after_ns(int(max(self._interval_ns, self._chain.period_ns)), 0)
 
     def take(self, reading: ChainReading) -> tuple[tuple[Cone, ...], list[str]]:
-        """The cones that are evidence of something, and a reason for every value that was refused."""
+        """A cone for every transducer that is configured, and a reason for every value that was refused."""
         cones: list[Cone] = []
         refused: list[str] = []
         for heard in reading.ranges:
@@ -499,8 +525,7 @@ class _ChainMemory:
             self._stamp_ns[place] = reading.stamp_ns
             range_m = self._range_of(heard.status, heard.range_m) if heard.heard_from is None else math.nan
             self._range_m[place] = range_m
-            if not math.isnan(range_m):
-                cones.append(Cone(self._chain.transducers[place].base_from_transducer, range_m))
+            cones.append(Cone(heard.channel, self._chain.transducers[place].base_from_transducer, range_m))
         return tuple(cones), refused
 
     def _range_of(self, status: RangeStatus, range_m: float) -> float:
@@ -529,6 +554,26 @@ class _ChainMemory:
             chain.range_max_m,
             tuple(range_m if is_fresh else math.nan for range_m, is_fresh in zip(self._range_m, fresh)),
         )
+
+
+def compose_many(a_from_b: Pose2, b_from_c: F64) -> F64:
+    """a_from_c (N, 3) of one pose and many."""
+    c, s = math.cos(a_from_b.yaw_rad), math.sin(a_from_b.yaw_rad)
+    x, y, yaw = b_from_c[:, 0], b_from_c[:, 1], b_from_c[:, 2]
+    return np.stack((a_from_b.x_m + c * x - s * y, a_from_b.y_m + s * x + c * y, a_from_b.yaw_rad + yaw), axis=-1)
+
+
+def carry(a_from_b: F64, b_from_c: Pose2) -> F64:
+    """a_from_c (N, 3) of many poses and one."""
+    c, s = np.cos(a_from_b[:, 2]), np.sin(a_from_b[:, 2])
+    return np.stack(
+        (
+            a_from_b[:, 0] + c * b_from_c.x_m - s * b_from_c.y_m,
+            a_from_b[:, 1] + s * b_from_c.x_m + c * b_from_c.y_m,
+            a_from_b[:, 2] + b_from_c.yaw_rad,
+        ),
+        axis=-1,
+    )
 
 
 def stale_after_ns(period_ns: int, sweep_ns: int) -> int:

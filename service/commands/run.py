@@ -1,0 +1,36 @@
+"""`umfeld run`: the daemon."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer()
+
+
+@app.command()
+def run(
+    *,
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", help="The configuration file; default: the first usual place.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE, wins over the file; repeatable.")
+    ] = None,
+) -> None:
+    """The daemon: devices in, maps out over Zenoh. Ends with SIGINT or SIGTERM.
+
+    Example: umfeld run --config /etc/umfeld/umfeld.toml
+    """
+    from service.config import load
+
+    loaded = load(config, settings=settings or ())  # first, so that a fault in it is told before anything heavy loads
+    logging.basicConfig(
+        level=loaded.config.log.level.upper(), format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", force=True
+    )
+    from service.daemon import Daemon
+
+    raise typer.Exit(Daemon(loaded).run())

@@ -1,0 +1,355 @@
+"""The daemon: which threads there are, in which order they start and stop, and that the process always ends.
+
+    wires (one thread each) --> fusion thread --> publisher's threads        keeper thread --> store
+    main thread: waits for a signal
+
+Start: the map's file, the kernels (warm before a port is opened, or the first scans would wait for them), the router,
+fusion, the keeper, the wires. Whatever cannot be had ends the start with one line and gives everything back. A device
+that is absent does not: the daemon waits for it and says so. Stop: the wires (devices are left safe), fusion, the last
+snapshot, the router. If that takes longer than EXIT_DEADLINE_S the process ends anyway.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import hashlib
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from drivers.reader import WireReader
+from service import assemble, health
+from service.clock import Clock, SystemClock
+from service.config import Config, Loaded
+from service.errors import Trouble
+from service.fusion import Fusion, OdometryOnly
+from service.live_map import LiveMap, restore
+from service.locks import Claims
+from service.outputs import HealthOut
+from service.payloads import RobotInfo, SensorPlace
+from service.publisher import Publisher
+from service.ros import RosSettings
+from service.sensors import Chain, Laser
+from service.store import MapStore, Provenance
+from service.systemd import Notifier
+from service.worker import Worker
+from service.zenoh_session import NetworkSettings, TlsFiles
+
+log = logging.getLogger(__name__)
+
+EXIT_DEADLINE_S = 8.0  # systemd would kill after 10
+_WIRE_STOP_S = 1.5
+_FUSION_STOP_S = 2.0
+_PUBLISHER_STOP_S = 2.0
+
+
+class Daemon:
+    """One robot's daemon. run() does everything; start() and stop() are for tests."""
+
+    def __init__(self, loaded: Loaded, *, clock: Clock | None = None, notifier: Notifier | None = None) -> None:
+        self._config = loaded.config
+        self._clock = clock or SystemClock()
+        self._notifier = notifier or Notifier()
+        self._sensors = assemble.sensors(self._config)
+        self._parts = contextlib.ExitStack()
+        self._readers: list[WireReader[Any]] = []
+        self._stop_asked = threading.Event()
+        self._clean = True
+        self._meter = health.ProcessMeter(self._clock.now_ns())
+
+    # --- the life of the process
+
+    def run(self) -> int:
+        """Start, wait for SIGINT or SIGTERM, stop; returns the exit code. Trouble if it cannot start."""
+        faulthandler.enable()
+        with _signals(self._stop_asked.set):
+            try:
+                self.start()
+                self._notifier.ready(self._summary())
+                log.info("%s", self._summary())
+                while not self._stop_asked.wait(1.0):
+                    self._notifier.status(self._summary())
+            finally:
+                self._notifier.stopping("closing ports and saving the map")
+                with _exit_deadline(EXIT_DEADLINE_S):
+                    clean = self.stop()
+        return 0 if clean else 1
+
+    def start(self) -> None:
+        """Bring everything up, or nothing: Trouble says why, with what had been started stopped again."""
+        try:
+            self._start_parts()
+        except BaseException:
+            self.stop()
+            raise
+
+    def stop(self) -> bool:
+        """Take everything down in the reverse order; False if something did not stop in time."""
+        self._clean = True
+        self._parts.close()
+        return self._clean
+
+    def _start_parts(self) -> None:
+        config, wires = self._config, assemble.wires(self._config)
+        claims = self._parts.enter_context(Claims())
+        claims.claim_ports(wire.port for wire in wires if wire.port is not None)
+        store = self._open_store()
+        maps = assemble.maps(config, self._sensors)
+        start_pose = None if store is None or maps.building is None else restore(maps.building.grid, store)
+        self._publisher = self._make_publisher()
+        self._parts.callback(self._close_publisher)
+        starting = _in_thread("router", self._publisher.start)  # takes half a second, the kernels as much
+        assemble.warm_up(config)
+        starting()
+        self._fusion = Fusion(
+            assemble.parts(
+                config, self._sensors, maps, OdometryOnly() if start_pose is None else OdometryOnly(start_pose)
+            )
+        )
+        self._worker = Worker(
+            self._fusion,
+            self._publisher.offer,
+            now_ns=self._clock.now_ns,
+            beat=self._notifier.beat,
+            health=self._health,
+        )
+        self._live_map = None
+        if maps.building is not None:
+            self._live_map = LiveMap(maps.building, store, ask=self._worker.ask, pose=self._fusion.pose)
+            self._publisher.calls.register_map_service(self._live_map)
+            self._parts.callback(self._finish_map, self._live_map)
+        self._readers = [wire.reader(self._worker.sink, self._clock.now_ns) for wire in wires]
+        self._publisher.publish_info(self._info())
+        self._worker.start()
+        self._parts.callback(self._stop_worker)
+        if self._live_map is not None and store is not None:
+            keeper = _Keeper(self._live_map, config.store.snapshot_period_s)
+            self._parts.callback(keeper.stop)
+            keeper.start()
+        self._parts.callback(self._stop_readers)
+        for reader in self._readers:
+            reader.start()
+
+    # --- parts
+
+    def _open_store(self) -> MapStore | None:
+        if not self._config.store.enabled or not self._config.grid.enabled:
+            return None
+        path = self._config.store_path()
+        store = self._parts.enter_context(MapStore.open(path, wall_ns=self._wall_ns))
+        if store.restored:
+            log.error("%s", store.restored)
+        digest = hashlib.sha256(self._config.model_dump_json().encode()).hexdigest()
+        devices = {name: type(sensor).__name__.lower() for name, sensor in self._sensors.items()}
+        store.add_provenance(Provenance(self._wall_ns(), _version(), digest, devices))
+        return store
+
+    def _make_publisher(self) -> Publisher:
+        config = self._config
+        ros = RosSettings(
+            distro=config.ros.distro,
+            domain_id=config.ros.domain_id,
+            lasers=tuple(sensor.name for sensor in self._sensors.values() if isinstance(sensor, Laser)),
+        )
+        return Publisher(
+            f"robots/{config.robot.id}",
+            network_settings(config),
+            clock=self._clock,
+            ros=ros if config.ros.enabled else None,
+        )
+
+    def _info(self) -> RobotInfo:
+        config = self._config
+        places: list[SensorPlace] = []
+        for sensor in self._sensors.values():
+            if isinstance(sensor, Laser):
+                places.append(SensorPlace(sensor.name, sensor.kind, sensor.base_from_sensor, sensor.height_m))
+            elif isinstance(sensor, Chain):
+                places.extend(
+                    SensorPlace(f"{sensor.name}_{number}", sensor.kind, each.base_from_transducer, each.height_m)
+                    for number, each in enumerate(sensor.transducers, start=1)
+                )
+        return RobotInfo(
+            config.robot.id,
+            f"robots/{config.robot.id}",
+            _version(),
+            self._wall_ns(),
+            tuple(places),
+            config.robot.footprint_m,
+        )
+
+    def _health(self, now_ns: int) -> HealthOut:
+        inside = health.Inside(
+            drops=self._fusion.drops,
+            counters={
+                **self._worker.counters(),
+                **self._fusion.counters(),
+                **{f"publish.{name}": count for name, count in self._publisher.counters().items()},
+                **({} if self._live_map is None else self._live_map.counters()),
+            },
+            troubles=[*self._fusion.troubles(now_ns), *self._map_troubles()],
+        )
+        kinds = {name: sensor.kind for name, sensor in self._sensors.items()}
+        wires = [reader.health() for reader in self._readers]
+        return health.report(wires, kinds, inside, self._meter.measure(now_ns), now_ns)
+
+    def _map_troubles(self) -> list[str]:
+        trouble = None if self._live_map is None else self._live_map.trouble()
+        return [] if trouble is None else [trouble]
+
+    def _summary(self) -> str:
+        config = self._config
+        return (
+            f"robots/{config.robot.id} on {', '.join(config.network.listen)}: "
+            f"{len(self._sensors)} devices on {len(self._readers)} wires"
+        )
+
+    def _wall_ns(self) -> int:
+        return self._clock.wall_from_monotonic_ns(self._clock.now_ns())
+
+    # --- the way down
+
+    def _stop_readers(self) -> None:
+        """All at once: a wire that hangs must not keep the others' lasers on."""
+
+        def stop(reader: WireReader[Any]) -> None:
+            self._note(reader.stop(_WIRE_STOP_S))
+
+        for wait in [_in_thread(f"stop {reader.name}", partial(stop, reader)) for reader in self._readers]:
+            wait()
+
+    def _stop_worker(self) -> None:
+        self._note(self._worker.stop(_FUSION_STOP_S))
+
+    def _finish_map(self, live_map: LiveMap) -> None:
+        try:
+            live_map.finish()
+        except Trouble as trouble:
+            log.error("the last snapshot was not written: %s", trouble)
+            self._clean = False
+
+    def _close_publisher(self) -> None:
+        self._note(self._publisher.close(_PUBLISHER_STOP_S))
+
+    def _note(self, in_time: bool) -> None:
+        self._clean = self._clean and in_time
+
+
+class _Keeper:
+    """The thread that writes snapshots."""
+
+    def __init__(self, live_map: LiveMap, period_s: float) -> None:
+        self._live_map = live_map
+        self._period_s = period_s
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopping.set()
+        self._thread.join(_FUSION_STOP_S)
+
+    def _run(self) -> None:
+        told: str | None = None
+        while not self._stopping.wait(self._period_s):
+            try:
+                self._live_map.snapshot()
+            except Exception:  # the map in memory is what counts; the disk is tried again
+                log.exception("internal error while saving the map; it is tried again")
+                continue
+            trouble = self._live_map.trouble()
+            if trouble is not None and trouble != told:
+                log.error("%s", trouble)
+            told = trouble
+
+
+def network_settings(config: Config) -> NetworkSettings:
+    """What the router needs of the configuration."""
+    network = config.network
+    tls = network.tls
+    return NetworkSettings(
+        listen=network.listen,
+        connect=network.connect,
+        tls=None
+        if tls is None
+        else TlsFiles(tls.root_ca_certificate, tls.listen_certificate, tls.listen_private_key, tls.mutual),
+        zenoh_config=None if network.config is None else Path(network.config).expanduser(),
+    )
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("umfeld")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _in_thread(name: str, work: Callable[[], object]) -> Callable[[], None]:
+    """Run something beside us; the function returned waits for it and raises what it raised."""
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            work()
+        except BaseException as error:  # handed to whoever waits
+            failed.append(error)
+
+    thread = threading.Thread(target=run, name=name, daemon=True)
+    thread.start()
+
+    def wait() -> None:
+        thread.join()
+        if failed:
+            raise failed[0]
+
+    return wait
+
+
+@contextlib.contextmanager
+def _signals(stop: Callable[[], None]) -> Iterator[None]:
+    """SIGINT and SIGTERM call stop(); the second one ends the process at once."""
+    count = 0
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        nonlocal count
+        count += 1
+        if count > 1:
+            os._exit(128 + number)
+        stop()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _exit_deadline(seconds: float) -> Iterator[None]:
+    """End the process, saying where it hangs, if the body takes longer."""
+
+    def end() -> None:
+        print(f"umfeld: not stopped within {seconds:.0f} s, ending now; the threads were at:", file=sys.stderr)
+        faulthandler.dump_traceback(file=sys.stderr)
+        os._exit(1)
+
+    timer = threading.Timer(seconds, end)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

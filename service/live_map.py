@@ -1,0 +1,194 @@
+"""The live map and the disk: restored at the start, saved while driving, copied, loaded and listed on request.
+
+Two layers a map: `grid` holds the grid's own tiles, from which it is restored exactly; `occupancy` the percentages that
+exports read. The grid belongs to the fusion thread: everything that touches it goes there by `ask`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from mapping.frames import IDENTITY, Pose2
+from mapping.grids.evidence import Model
+from mapping.grids.occupancy import GridTile, OccupancyGrid
+from mapping.grids.tiles import TILE
+from service.errors import Trouble
+from service.layers import BuildingLayer
+from service.rpc import CallRefused
+from service.store import OCCUPANCY, SUFFIX, MapStore, SnapshotQueue, Tile, list_maps, occupancy_tiles
+
+log = logging.getLogger(__name__)
+
+GRID = "grid"
+"""The layer of tiles as OccupancyGrid.load_tile takes them; meta `grid` has resolution_m, model and tile_cells."""
+
+T = TypeVar("T")
+
+
+class Ask(Protocol):
+    """Runs a function where the grid may be touched, and gives its result."""
+
+    def __call__(self, work: Callable[[], T], /) -> T: ...
+
+
+class LiveMap:
+    """One building's grid and the store behind it. Calls may come from any thread."""
+
+    def __init__(
+        self, layer: BuildingLayer, store: MapStore | None, *, ask: Ask, pose: Callable[[], Pose2 | None]
+    ) -> None:
+        """pose: where the robot is in the map, asked where the grid may be touched."""
+        self._layer = layer
+        self._store = store
+        self._queue = None if store is None else SnapshotQueue(store)
+        self._ask = ask
+        self._pose = pose
+
+    # --- while running
+
+    def snapshot(self) -> bool:
+        """Write what changed since the last one; False if the disk refused (it is tried again with the next)."""
+        if self._queue is None:
+            return True
+        changed, pose = self._ask(lambda: (self._layer.grid.changed_tiles(), self._pose()))
+        if changed:
+            self._queue.offer(GRID, ((tile.tile_row, tile.tile_col, tile.payload()) for tile in changed))
+            self._queue.offer(OCCUPANCY, occupancy_of(changed), self._meta(pose))
+        return self._queue.commit()
+
+    def counters(self) -> dict[str, int]:
+        """Commits and tiles written, and what failed."""
+        return {} if self._queue is None else {**self._queue.counts, "store_waiting": self._queue.waiting}
+
+    def trouble(self) -> str | None:
+        """Why the last snapshot was not written."""
+        return None if self._queue is None else self._queue.trouble
+
+    def finish(self) -> None:
+        """The last snapshot, and a whole copy as the newest generation."""
+        if self._store is not None and self.snapshot():
+            self._store.keep_generation()
+
+    def _meta(self, pose: Pose2 | None) -> dict[str, Any]:
+        grid = self._layer.grid
+        meta: dict[str, Any] = {
+            GRID: {"resolution_m": grid.resolution_m, "model": grid.model, "tile_cells": TILE},
+            OCCUPANCY: {"resolution_m": grid.resolution_m, "tile_cells": TILE},
+        }
+        if pose is not None:
+            meta["pose"] = {"x_m": pose.x_m, "y_m": pose.y_m, "yaw_rad": pose.yaw_rad}
+        return meta
+
+    # --- calls
+
+    def save(self, name: str) -> Mapping[str, Any]:
+        """Write the map now, under this name beside the live one."""
+        store = self._needed_store()
+        if not self.snapshot():
+            raise CallRefused(f"not saved: {self.trouble()}")
+        return store.save_as(store.path.parent / f"{name}{SUFFIX}").document()
+
+    def load(self, name: str) -> Mapping[str, Any]:
+        """Replace the live map by the one saved under this name. The robot's pose stays as it is."""
+        store = self._needed_store()
+        path = store.path.parent / f"{name}{SUFFIX}"
+        if path == store.path:
+            raise CallRefused(f"{name} is the live map itself; save it under another name first")
+        with MapStore.open(path, wall_ns=lambda: 0, read_only=True) as saved:
+            tiles = saved.load_tiles(GRID)
+            ready_made = saved.load_tiles(OCCUPANCY)
+            check_fits(self._layer.grid, saved)
+        self._check_tiles(path, tiles)
+        self.snapshot()  # so that nothing older waits behind what is written next
+        self._ask(lambda: replace_tiles(self._layer, tiles))
+        meta = self._meta(None)
+        store.snapshot({GRID: tiles, OCCUPANCY: ready_made}, meta, replace=True)
+        return {"name": name, "path": str(path), "tiles": len(tiles)}
+
+    def _check_tiles(self, path: Path, tiles: Iterable[Tile]) -> None:
+        """Load them aside first: the live map is replaced as a whole or not at all."""
+        live = self._layer.grid
+        aside = OccupancyGrid(resolution_m=live.resolution_m, model=live.model)
+        try:
+            for row, column, payload in tiles:
+                aside.load_tile(row, column, payload)
+        except ValueError as error:
+            raise CallRefused(f"{path}: {error}; the live map is as it was") from error
+
+    def list(self) -> Mapping[str, Any]:
+        """Every map beside the live one."""
+        return {"maps": list_maps(self._needed_store().path.parent)}
+
+    def info(self) -> Mapping[str, Any]:
+        """About the live map."""
+        patch = self._ask(self._layer.grid.patch)
+        known = patch.cells >= 0
+        about: dict[str, Any] = {
+            "resolution_m": patch.resolution_m,
+            "rows": patch.cells.shape[0],
+            "columns": patch.cells.shape[1],
+            "origin_m": [patch.col0 * patch.resolution_m, patch.row0 * patch.resolution_m],
+            "known_cells": int(known.sum()),
+            "occupied_cells": int((patch.cells >= 65).sum()),
+        }
+        return about | ({} if self._store is None else {"store": self._store.info()})
+
+    def _needed_store(self) -> MapStore:
+        if self._store is None:
+            raise CallRefused("the daemon keeps no map on disk: set [store] enabled = true and start it again")
+        return self._store
+
+
+def restore(grid: OccupancyGrid, store: MapStore) -> Pose2:
+    """Fill a grid from a store; returns where the robot last was in that map.
+
+    Trouble if the store's map was made with another resolution or model.
+    """
+    check_fits(grid, store)
+    refused = 0
+    for row, column, payload in store.load_tiles(GRID):
+        try:
+            grid.load_tile(row, column, payload)
+        except ValueError as error:
+            refused += 1
+            log.error("%s: tile %d, %d is left out: %s", store.path, row, column, error)
+    if refused:
+        log.error("%s: %d tiles were left out; older ones are in %s.1", store.path, refused, store.path.name)
+    pose = store.get_meta("pose")
+    return IDENTITY if not isinstance(pose, dict) else Pose2(pose["x_m"], pose["y_m"], pose["yaw_rad"])
+
+
+def check_fits(grid: OccupancyGrid, store: MapStore) -> None:
+    """Trouble if a stored map cannot be put into this grid; names the setting that makes it fit."""
+    made_with = store.get_meta(GRID)
+    if not made_with:
+        return
+    for key, ours in (("resolution_m", grid.resolution_m), ("model", grid.model)):
+        theirs = made_with.get(key)
+        if theirs != ours:
+            raise Trouble(
+                f"{store.path}: this map has {key} {theirs}, the configuration {ours}; set {key} in [grid], or another "
+                "path in [store]"
+            )
+
+
+def replace_tiles(layer: BuildingLayer, tiles: Iterable[Tile]) -> None:
+    """Forget the live grid and take these tiles instead."""
+    layer.grid.clear()
+    for row, column, payload in tiles:
+        layer.grid.load_tile(row, column, payload)
+    layer.start_anew()
+
+
+def occupancy_of(changed: Iterable[GridTile]) -> list[Tile]:
+    """Percentages of tiles, made from their copies: for the thread that writes."""
+    found: list[Tile] = []
+    for tile in changed:
+        model: Model = tile.model
+        alone = OccupancyGrid(resolution_m=tile.resolution_m, model=model, max_tiles=1)
+        alone.load_tile(tile.tile_row, tile.tile_col, tile.payload())
+        found.extend(occupancy_tiles(alone.patch(whole_tiles=True), TILE))
+    return found
