@@ -16,6 +16,7 @@ from numba import njit
 
 TWO_PI = 2.0 * math.pi
 EDGE_RAD = 1e-9  # bearings closer to an edge than this lie on it
+TOUCH_M = 1e-9  # a shorter stretch is a touch
 MAX_CUTS = 64  # of one segment with the outline of the vehicle
 
 
@@ -124,6 +125,8 @@ def nearest_outside(ax: float, ay: float, bx: float, by: float, polygon: Any, re
     for k in range(count - 1):
         lo, hi = order[k], order[k + 1]
         middle = 0.5 * (lo + hi)
+        if (hi - lo) * (abs(ex) + abs(ey)) < TOUCH_M:
+            continue
         if point_in_polygon(ax + middle * ex, ay + middle * ey, polygon):
             continue
         nx, ny = nearest_on(ax + lo * ex, ay + lo * ey, ax + hi * ex, ay + hi * ey)
@@ -192,15 +195,19 @@ def free_reach(border: Any, edges: Any, width: float, polygon: Any, reach: float
             last = first + sweep
             if last < 0.0 or first > span:
                 continue
-            for sector in range(max(0, int(first / width)), min(count - 1, int(last / width)) + 1):
+            low, high = math.floor(first / width), math.floor(last / width)
+            for sector in range(max(0, low), min(count - 1, high) + 1):
                 if near >= free[sector]:
+                    continue
+                if low == high and near > reach:  # all of it lies in this sector, outside the vehicle
+                    free[sector] = near
                     continue
                 t0, t1 = clip_to_wedge(
                     ax, ay, bx, by, edge_x[sector], edge_y[sector], edge_x[sector + 1], edge_y[sector + 1]
                 )
-                if t0 > t1:
-                    continue
                 ex, ey = bx - ax, by - ay
+                if (t1 - t0) * (abs(ex) + abs(ey)) < TOUCH_M:
+                    continue  # it passes by, or ends on the edge
                 found = nearest_outside(ax + t0 * ex, ay + t0 * ey, ax + t1 * ex, ay + t1 * ey, polygon, reach)
                 free[sector] = min(free[sector], found)
     return free
