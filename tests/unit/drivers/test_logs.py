@@ -323,7 +323,7 @@ def test_recorded_logs(
     assert {len(s.range_m) for s in log.scans} == beams
     assert seconds is None or log.duration_s == pytest.approx(seconds, abs=1.0)
     steps = np.diff(log.odometry.pose[:, :2], axis=0)
-    assert way_m is None or float(np.hypot(*steps.T).sum()) == pytest.approx(way_m, abs=0.6)
+    assert way_m is None or float(np.hypot(*steps.T).sum()) == pytest.approx(way_m, abs=1.2)
     ranges = np.concatenate([s.range_m for s in log.scans])
     assert np.isinf(ranges).mean() == pytest.approx(no_echo, abs=0.001)
     assert log.robot_from_laser[:2] == pytest.approx(offset, abs=1e-3)
