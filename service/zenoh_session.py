@@ -72,8 +72,7 @@ class TlsFiles:
 @dataclass(frozen=True, slots=True)
 class NetworkSettings:
     """listen: where the router listens.  connect: other routers to link to.  zenoh_config: a Zenoh configuration file
-    whose values (certificates, access rules, limits, and `listen` if it names one) are laid over ours; scouting stays
-    off in any case."""
+    (access rules, users, limits) laid under ours; endpoints and scouting are decided here alone."""
 
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     connect: tuple[str, ...] = ()
@@ -93,19 +92,17 @@ def open_router(settings: NetworkSettings) -> zenoh.Session:
         "listen/exit_on_failure": True,
         "connect/exit_on_failure": False,  # a fleet router that is down is tried again for ever
         "connect/timeout_ms": -1,
+        "listen/endpoints": list(settings.listen),
+        "connect/endpoints": list(settings.connect),
     }
-    if settings.zenoh_config is None or not _endpoints(config, "listen"):
-        values["listen/endpoints"] = list(settings.listen)
-    if settings.zenoh_config is None or settings.connect or not _endpoints(config, "connect"):
-        values["connect/endpoints"] = list(settings.connect)
     if settings.tls is not None:
         values |= settings.tls.values()
     _insert(config, values)
-    refuse_open_listeners(_endpoints(config, "listen"))
+    refuse_open_listeners(settings.listen)
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise _explain_open(error, _endpoints(config, "listen")) from error
+        raise _explain_open(error, settings.listen) from error
 
 
 def open_client(endpoint: str = DEFAULT_ENDPOINT, *, zenoh_config: Path | None = None) -> zenoh.Session:
@@ -148,14 +145,6 @@ def _insert(config: zenoh.Config, values: Mapping[str, object]) -> None:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
             raise NetworkTrouble(f"zenoh refuses {key} = {value!r}: {_first_line(error)}") from error
-
-
-def _endpoints(config: zenoh.Config, kind: str) -> list[str]:
-    """The endpoints of a configuration; some versions keep them by mode."""
-    raw = json.loads(config.get_json(f"{kind}/endpoints"))
-    if isinstance(raw, dict):
-        raw = raw.get("router", [])
-    return [str(endpoint) for endpoint in raw or []]
 
 
 def refuse_open_listeners(endpoints: Sequence[str]) -> None:
@@ -289,7 +278,8 @@ class Client:
 
     def bases(self, *, timeout_s: float = 1.0) -> list[str]:
         """Key bases of the robots that are alive, sorted."""
-        replies = self.session.liveliness().get(f"**/{ALIVE}", timeout=timeout_s)
+        # Not `**`: access rules admit a question only if they cover all of it.
+        replies = self.session.liveliness().get(f"robots/*/{ALIVE}", timeout=timeout_s)
         found = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
         return sorted(key.removesuffix(f"/{ALIVE}") for key in found)
 

@@ -1,0 +1,196 @@
+"""The access rules in deploy/, with certificates made as its README says: what must pass passes, the rest does not."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapping.frames import Pose2
+from mapping.grids.patch import GridPatch
+from mapping.scan import Scan
+from service.clock import SystemClock
+from service.outputs import GridOut, ScanOut
+from service.publisher import Publisher
+from service.zenoh_session import CallFailed, Client, NetworkSettings, NetworkTrouble, TlsFiles
+
+DEPLOY = Path(__file__).parents[2] / "deploy"
+BASE = "robots/r1"
+
+pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the openssl command")
+
+MAKE_CERTIFICATES = """
+set -e
+authority() {
+  openssl ecparam -name prime256v1 -genkey -noout -out $1.key
+  openssl req -x509 -new -key $1.key -days 30 -subj /CN=$1 -out $1.crt \
+    -addext basicConstraints=critical,CA:TRUE -addext keyUsage=critical,keyCertSign
+}
+issue() {
+  openssl ecparam -name prime256v1 -genkey -noout -out $1.key
+  openssl req -new -key $1.key -subj /CN=$3 -out $1.csr
+  printf 'extendedKeyUsage=serverAuth,clientAuth\\nsubjectAltName=%s\\n' $4 > $1.ext
+  openssl x509 -req -in $1.csr -CA $2.crt -CAkey $2.key -CAcreateserial -days 30 -extfile $1.ext -out $1.crt
+}
+authority ca
+authority otherca
+issue mapper ca mapper DNS:localhost,IP:127.0.0.1
+issue viewer ca viewer DNS:viewer
+issue operator ca operator DNS:operator
+issue stranger ca stranger DNS:stranger
+issue forged otherca operator DNS:operator
+"""
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tls")
+    subprocess.run(["bash", "-c", MAKE_CERTIFICATES], cwd=folder, check=True, capture_output=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def endpoints(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    return f"unixsock-stream/{tmp_path_factory.mktemp('run')}/zenoh.sock", f"tls/127.0.0.1:{port}"
+
+
+@pytest.fixture(scope="module")
+def publisher(certificates: Path, endpoints: tuple[str, str]) -> Iterator[Publisher]:
+    authority, certificate, key = (str(certificates / name) for name in ("ca.crt", "mapper.crt", "mapper.key"))
+    files = TlsFiles(authority, certificate, key)
+    settings = NetworkSettings(listen=endpoints, tls=files, zenoh_config=DEPLOY / "zenoh-security.json5")
+    made = Publisher(BASE, settings, clock=SystemClock())
+
+    def greet(_arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        return {"hello": True}
+
+    made.calls.register("greet", greet)
+    made.start()
+    made.offer(GridOut(1, 1, GridPatch(0.1, 0, 0, np.zeros((2, 2), np.int8))))
+    yield made
+    assert made.close()
+
+
+def client_of(certificates: Path, endpoint: str, name: str | None) -> Client:
+    """A client with the certificate of that name, or with none."""
+    tls: dict[str, Any] = {"root_ca_certificate": str(certificates / "ca.crt")}
+    if name is not None:
+        tls |= {
+            "connect_certificate": str(certificates / f"{name}.crt"),
+            "connect_private_key": str(certificates / f"{name}.key"),
+            "enable_mtls": True,
+        }
+    path = certificates / f"client-{name}.json5"
+    path.write_text(json.dumps({"transport": {"unicast": {"compression": {"enabled": True}}, "link": {"tls": tls}}}))
+    return Client(endpoint, zenoh_config=path)
+
+
+def wait_until(condition: Callable[[], Any], seconds: float = 5.0) -> Any:
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+    return value
+
+
+def scan(publisher: Publisher) -> None:
+    swept = Scan(SystemClock().now_ns(), 0.0, np.linspace(-1, 1, 3), np.ones(3), 0.1, 30.0)
+    publisher.offer(ScanOut("front", swept, Pose2(), 0.0))
+
+
+def next_scan(publisher: Publisher, subscriber: Any) -> Any:
+    scan(publisher)
+    return subscriber.try_recv()
+
+
+@pytest.mark.parametrize("name", ["viewer", "operator"])
+def test_readers_read(publisher: Publisher, certificates: Path, endpoints: tuple[str, str], name: str) -> None:
+    with client_of(certificates, endpoints[1], name) as client:
+        assert wait_until(client.bases) == [BASE]
+        assert wait_until(lambda: client.get(f"{BASE}/map/grid"))
+        live = client.subscribe(f"{BASE}/scan/**")
+        wait_until(lambda: next_scan(publisher, live))
+        late = client.subscribe_latched(f"{BASE}/map/**")
+        wait_until(late.try_recv)
+
+
+def test_only_operators_call(publisher: Publisher, certificates: Path, endpoints: tuple[str, str]) -> None:
+    with client_of(certificates, endpoints[1], "operator") as operator:
+        assert operator.call(BASE, "greet") == {"hello": True}
+    answered = publisher.calls.answered
+    with client_of(certificates, endpoints[1], "viewer") as viewer:
+        assert viewer.get(f"{BASE}/map/grid")  # it is connected
+        with pytest.raises(CallFailed, match="does not answer"):
+            viewer.call(BASE, "greet", timeout_s=0.7)
+    assert publisher.calls.answered == answered
+
+
+@pytest.mark.parametrize("name", ["viewer", "operator"])
+def test_readers_cannot_speak_for_the_robot(
+    publisher: Publisher, certificates: Path, endpoints: tuple[str, str], name: str
+) -> None:
+    with client_of(certificates, endpoints[0], None) as witness, client_of(certificates, endpoints[1], name) as reader:
+        heard = witness.subscribe(f"{BASE}/**")
+        wait_until(lambda: next_scan(publisher, heard))
+        reader.session.put(f"{BASE}/pose", b"forged")
+        reader.session.put(f"{BASE}/map/grid", b"forged")
+        token: Any = reader.session.liveliness().declare_token("robots/r2/alive")
+        end = time.monotonic() + 0.5
+        while time.monotonic() < end:
+            sample = next_scan(publisher, heard)
+            assert sample is None or bytes(sample.payload) != b"forged"
+        assert witness.bases() == [BASE]
+        token.undeclare()
+
+
+def test_a_certified_stranger_sees_nothing(
+    publisher: Publisher, certificates: Path, endpoints: tuple[str, str]
+) -> None:
+    with client_of(certificates, endpoints[1], "stranger") as stranger:
+        assert stranger.bases(timeout_s=0.5) == []
+        assert stranger.get("**", timeout_s=0.5) == []
+        live = stranger.subscribe("**")
+        for _ in range(20):
+            assert next_scan(publisher, live) is None
+            time.sleep(0.02)
+
+
+def test_the_owner_on_the_robot_may_do_everything(
+    publisher: Publisher, certificates: Path, endpoints: tuple[str, str]
+) -> None:
+    with client_of(certificates, endpoints[0], None) as owner:
+        assert owner.call(BASE, "greet") == {"hello": True}
+        assert owner.get(f"{BASE}/map/**")
+
+
+@pytest.mark.parametrize("name", [None, "forged"])
+def test_without_a_certificate_of_ours_there_is_no_connection(
+    publisher: Publisher, certificates: Path, endpoints: tuple[str, str], name: str | None
+) -> None:
+    scan(publisher)
+    with pytest.raises(NetworkTrouble):
+        client_of(certificates, endpoints[1], name)
+
+
+def test_plain_tcp_is_refused(publisher: Publisher, endpoints: tuple[str, str]) -> None:
+    scan(publisher)
+    with pytest.raises(NetworkTrouble):
+        Client(endpoints[1].replace("tls/", "tcp/"))
+
+
+def test_the_file_forbids_plain_listening() -> None:
+    settings = NetworkSettings(listen=("tcp/127.0.0.1:0",), zenoh_config=DEPLOY / "zenoh-security.json5")
+    with pytest.raises(NetworkTrouble, match=r"cannot listen on tcp/127\.0\.0\.1:0"):
+        Publisher(BASE, settings, clock=SystemClock()).start()
