@@ -168,9 +168,9 @@ def laser_profile(log: Log, *, sweep_s: float = 0.025) -> LaserProfile:
     last = first + len(widest.bearing_rad) - 1
     return replace(
         URG_04LX,
-        model="LOG-PLAYER",
+        model="URG-LOG",  # its family tells hosts what codes below the least distance mean
         vendor="umfeld",
-        product="Recorded log",
+        product="SOKUIKI Sensor URG-LOG, a recorded log",
         firmware="1.0.0",
         serial="L" + log.provenance.sha256[:7],
         dmin_mm=20,
