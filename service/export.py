@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.frames import Pose2
+from mapping.frames import IDENTITY, Pose2
 from mapping.grids.patch import GridPatch
 from service import topics
 from service.files import FileTrouble, Receipt, write_whole
@@ -49,8 +50,7 @@ class MapImage:
 
 def image_of(patch: GridPatch) -> MapImage:
     """A patch as a map image: its origin lies on a cell border, unturned."""
-    r = patch.resolution_m
-    return MapImage(patch.cells, r, Pose2(patch.col0 * r, patch.row0 * r, 0.0))
+    return MapImage(patch.cells, patch.resolution_m, grid_origin(patch))
 
 
 def patch_of(image: MapImage, resolution_m: float | None = None) -> GridPatch:
@@ -118,26 +118,35 @@ def npy_bytes(cells: I8) -> bytes:
     return out.getvalue()
 
 
-def grid_document(patch: GridPatch, stamp_ns: int) -> dict[str, object]:
-    """umfeld.grid.v1: rows of cells, the lowest row first."""
-    return {**grid_properties(patch, stamp_ns), "schema": "umfeld.grid.v1", "cells": patch.cells.tolist()}
+def grid_origin(patch: GridPatch, frame_from_grid: Pose2 = IDENTITY) -> Pose2:
+    """The lower left corner of a patch's first cell, in the frame that frame_from_grid leads to."""
+    r = patch.resolution_m
+    return frame_from_grid @ Pose2(patch.col0 * r, patch.row0 * r, 0.0)
 
 
-def grid_properties(patch: GridPatch, stamp_ns: int) -> dict[str, object]:
+def grid_properties(
+    patch: GridPatch, stamp_ns: int, *, frame: str = "map", frame_from_grid: Pose2 = IDENTITY
+) -> dict[str, object]:
     """What a picture of a grid does not say: where it lies and how large its cells are."""
     seconds, nanos = divmod(stamp_ns, 1_000_000_000)
-    r = patch.resolution_m
+    origin = grid_origin(patch, frame_from_grid)
     return {
         "stamp": {"sec": seconds, "nanosec": nanos},
-        "frame": "map",
-        "resolution_m": r,
+        "frame": frame,
+        "resolution_m": patch.resolution_m,
         "rows": patch.cells.shape[0],
         "columns": patch.cells.shape[1],
-        "origin": {"x_m": round(patch.col0 * r, 9), "y_m": round(patch.row0 * r, 9), "yaw_rad": 0.0},
+        "origin": {"x_m": round(origin.x_m, 9), "y_m": round(origin.y_m, 9), "yaw_rad": origin.yaw_rad},
     }
 
 
-def render_grid(patch: GridPatch, form: str, stamp_ns: int) -> tuple[bytes, str]:
+def json_bytes(patch: GridPatch, properties: Mapping[str, object]) -> bytes:
+    """umfeld.grid.v1: the properties, and rows of cells, the lowest row first."""
+    document = {"schema": "umfeld.grid.v1", **properties, "cells": patch.cells.tolist()}
+    return json.dumps(document, separators=(",", ":")).encode()
+
+
+def render_grid(patch: GridPatch, form: str, properties: Mapping[str, object]) -> tuple[bytes, str]:
     """A grid in one of GRID_FORMATS, and the Zenoh encoding of that; ValueError for another."""
     match form:
         case "png":
@@ -147,7 +156,7 @@ def render_grid(patch: GridPatch, form: str, stamp_ns: int) -> tuple[bytes, str]
         case "npy":
             return npy_bytes(patch.cells), "application/x-npy"
         case "json":
-            return json.dumps(grid_document(patch, stamp_ns), separators=(",", ":")).encode(), topics.JSON_GRID
+            return json_bytes(patch, properties), topics.JSON_GRID
     raise ValueError(f"format {form!r}: there are {', '.join(GRID_FORMATS)}")
 
 
@@ -189,8 +198,8 @@ def save_grid(image: MapImage, path: Path, *, stamp_ns: int = 0) -> list[Receipt
         case ".npy":
             return [write_whole(path, npy_bytes(image.cells))]
         case ".json":
-            document = grid_document(patch_of(image), stamp_ns)
-            return [write_whole(path, json.dumps(document, separators=(",", ":")).encode())]
+            patch = patch_of(image)
+            return [write_whole(path, json_bytes(patch, grid_properties(patch, stamp_ns)))]
     raise MapFileTrouble(f"{path}: unknown ending {path.suffix!r}; there are .yaml (with .pgm), .png, .npy, .json")
 
 

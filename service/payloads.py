@@ -21,6 +21,7 @@ from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot, SectorState
 from service import cdr, topics
+from service.export import grid_origin
 from service.outputs import (
     GridOut,
     GridUpdateOut,
@@ -239,10 +240,12 @@ class Encoder:
         return messages
 
     def _full_grid(self, out: GridOut, offset_ns: int) -> Message:
-        stamp_ns = out.stamp_ns + offset_ns
-        self._grid = _GridPlace(out.epoch, out.patch.row0, out.patch.col0, *out.patch.cells.shape)
-        payload = cdr.encode_grid(grid_message(out.patch, self._frames.map, stamp_ns))
-        return Message(topics.MAP_GRID, "map/grid", payload, stamp_ns, GRID_ATTACHMENT.pack(out.epoch, 0))
+        stamp_ns, suffix = out.stamp_ns + offset_ns, f"map/{out.name}"
+        topic = topics.topic_of(suffix)
+        if topic is topics.MAP_GRID:
+            self._grid = _GridPlace(out.epoch, out.patch.row0, out.patch.col0, *out.patch.cells.shape)
+        payload = cdr.encode_grid(grid_message(out.patch, out.frame, out.frame_from_grid, stamp_ns))
+        return Message(topic, suffix, payload, stamp_ns, GRID_ATTACHMENT.pack(out.epoch, 0))
 
     def _grid_update(self, out: GridUpdateOut, offset_ns: int) -> list[Message]:
         place = self._grid
@@ -360,10 +363,11 @@ def _even_bins(bearing_rad: F64, range_m: F32) -> tuple[F32, float, float]:
     return bins, low, high - low
 
 
-def grid_message(patch: GridPatch, frame: str, stamp_ns: int) -> cdr.Grid:
+def grid_message(patch: GridPatch, frame: str, frame_from_grid: Pose2, stamp_ns: int) -> cdr.Grid:
     """A grid as OccupancyGrid: row 0 lowest, origin at the lower left corner of the first cell."""
-    r = patch.resolution_m
-    return cdr.Grid(stamp_ns, frame, r, (patch.col0 * r, patch.row0 * r, 0.0), (0.0, 0.0, 0.0, 1.0), patch.cells)
+    origin = grid_origin(patch, frame_from_grid)
+    position, turn = (origin.x_m, origin.y_m, 0.0), _quaternion(origin.yaw_rad)
+    return cdr.Grid(stamp_ns, frame, patch.resolution_m, position, turn, patch.cells)
 
 
 def ranges_document(out: RangesOut, stamp_ns: int, base_frame: str) -> dict[str, object]:

@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from mapping.grids.patch import GridPatch
 from service import export, topics, zenoh_session
 from service.clock import Clock
 from service.outputs import GridOut, GridUpdateOut, HealthOut, OdomOut, Output, PolarOut, PoseOut, RectOut, ScanOut
@@ -81,10 +80,10 @@ class Outbox:
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """The last value of a key. patch: the grid behind it, for other formats."""
+    """The last value of a key. grid: what is behind it, for other formats."""
 
     message: Message
-    patch: GridPatch | None = None
+    grid: GridOut | None = None
 
 
 class Publisher:
@@ -150,8 +149,10 @@ class Publisher:
             return self._encode(output)
 
         match output:
-            case GridOut():
+            case GridOut(name="grid"):
                 self._outboxes[Lane.MAP].put(slot, parcel, supersedes=topics.MAP_GRID_UPDATE.pattern)
+            case GridOut():
+                self._outboxes[Lane.MAP].put(slot, parcel)
             case GridUpdateOut():
                 self._outboxes[Lane.MAP].put(slot, parcel, depth=_UPDATES_WAITING_MAX)
             case _:
@@ -192,7 +193,7 @@ class Publisher:
     def _encode(self, output: Output) -> list[Message]:
         messages = self._encoder.encode(output, self._clock.wall_from_monotonic_ns(0))
         if isinstance(output, GridOut):
-            self._last[messages[0].suffix] = _Kept(messages[0], output.patch)
+            self._last[messages[0].suffix] = _Kept(messages[0], output)
         return messages
 
     def _send_loop(self, outbox: Outbox) -> None:
@@ -265,13 +266,16 @@ class Publisher:
             key = f"{self.base}/{suffix}"
             if not wanted.intersects(key) or kept.message.stamp_ns < youngest_ns:
                 continue
-            if picture is None or kept.patch is None:
+            if picture is None or kept.grid is None:
                 message = kept.message
                 query.reply(key, message.payload, encoding=message.encoding, attachment=message.attachment)
             elif picture in export.GRID_FORMATS:
-                payload, encoding = export.render_grid(kept.patch, picture, kept.message.stamp_ns)
-                properties = json.dumps(export.grid_properties(kept.patch, kept.message.stamp_ns))
-                query.reply(key, payload, encoding=encoding, attachment=properties)
+                grid = kept.grid
+                properties = export.grid_properties(
+                    grid.patch, kept.message.stamp_ns, frame=grid.frame, frame_from_grid=grid.frame_from_grid
+                )
+                payload, encoding = export.render_grid(grid.patch, picture, properties)
+                query.reply(key, payload, encoding=encoding, attachment=json.dumps(properties))
             else:
                 text = f"format={picture}: there are {', '.join(export.GRID_FORMATS)}"
                 query.reply_err(text.encode(), encoding="text/plain")
@@ -301,7 +305,7 @@ def slot_of(output: Output) -> str:
         case PoseOut():
             return "pose"
         case GridOut():
-            return topics.MAP_GRID.pattern
+            return f"map/{output.name}"
         case GridUpdateOut():
             return topics.MAP_GRID_UPDATE.pattern
         case HealthOut():

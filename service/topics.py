@@ -186,6 +186,26 @@ MAP_GRID_UPDATE = Topic(
     lane=Lane.MAP,
     every_value=True,
 )
+MAP_LOCAL = Topic(
+    "map/local",
+    GRID,
+    cdr(GRID),
+    "at most 5 Hz, on change",
+    "A small grid around the vehicle that forgets what it leaves behind, always whole; if configured.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
+MAP_ARTOS = Topic(
+    "map/artos",
+    GRID,
+    cdr(GRID),
+    "at most 5 Hz, on change",
+    "The two-step map made from sector maps, always whole; if configured.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 HEALTH = Topic(
     "health",
     DIAGNOSTICS,
@@ -237,6 +257,8 @@ TOPICS: tuple[Topic, ...] = (
     TF_STATIC,
     MAP_GRID,
     MAP_GRID_UPDATE,
+    MAP_LOCAL,
+    MAP_ARTOS,
     HEALTH,
     HEALTH_JSON,  # before health/<sensor>: the exact key wins
     HEALTH_ONE,

@@ -342,3 +342,20 @@ def test_cost_stays_small() -> None:
             encoder.encode(output, 0)
             best = min(best, time.perf_counter() - begin)
         assert best < limit_s
+
+
+def test_other_grids_lie_in_their_own_frame_and_leave_the_first_alone() -> None:
+    encoder = Encoder()
+    encoder.encode(grid_out(1, 0, 0, (4, 4)), OFFSET)
+    patch = GridPatch(0.1, 0, 10, np.zeros((2, 3), np.int8))
+    turned = Pose2(2.0, 1.0, math.pi / 2)
+    (message,) = encoder.encode(GridOut(0, 9, patch, "artos", "odom", turned), OFFSET)
+    grid = cdr.decode_grid(message.payload)
+    assert (message.suffix, grid.frame) == ("map/artos", "odom")
+    assert message.topic is topics.MAP_ARTOS
+    assert grid.origin_position == pytest.approx((2.0, 2.0, 0.0))
+    assert grid.origin_orientation == pytest.approx((0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))
+    update = GridUpdateOut(0, 1, GridPatch(0.05, 3, 3, np.zeros((1, 1), np.int8)))
+    assert len(encoder.encode(update, OFFSET)) == 1
+    with pytest.raises(KeyError, match="no topic"):
+        encoder.encode(GridOut(0, 1, patch, "nameless"), OFFSET)

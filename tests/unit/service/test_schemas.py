@@ -117,7 +117,8 @@ def test_other_sent_documents_hold() -> None:
     check(encoder.encode(HealthOut(0, 1, "", (source,), {"a": 1}, {"cpu_percent": math.nan}), 0)[1].payload)
     place = SensorPlace("front", "laser", Pose2(), 0.1)
     check(encoder.info(RobotInfo("r1", "robots/r1", "0", 0, (place,), ((1.0, 2.0),)))[0].payload)
-    check(export.render_grid(GridPatch(0.05, 0, 0, np.zeros((2, 3), np.int8)), "json", 0)[0])
+    patch = GridPatch(0.05, 0, 0, np.zeros((2, 3), np.int8))
+    check(export.render_grid(patch, "json", export.grid_properties(patch, 0))[0])
 
 
 @pytest.mark.parametrize(
