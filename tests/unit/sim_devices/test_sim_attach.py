@@ -1,0 +1,295 @@
+"""Links and the loop that serves devices on them."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import termios
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import serial
+
+from sim_devices.attach import Attachment, MemoryLink, PtyLink, TcpLink
+
+
+class Upper:
+    """A device that answers in capitals and notes the line speeds it is told."""
+
+    def __init__(self) -> None:
+        self.bauds: list[int | None] = []
+        self.lost = 0
+        self.next_ns: int | None = None
+        self.plugged = True
+
+    def step(self, now_ns: int, received: bytes, baud: int | None = None) -> bytes:
+        self.bauds.append(baud)
+        return received.upper()
+
+    def link_lost(self, now_ns: int) -> None:
+        self.lost += 1
+
+
+def eventually(true: Callable[[], bool], timeout_s: float = 3.0) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if true():
+            return True
+        time.sleep(0.002)
+    return true()
+
+
+# -- ptys -------------------------------------------------------------------------------------------------------------
+
+
+def test_pty_is_raw_and_published_by_its_name(tmp_path: Path) -> None:
+    link = PtyLink(tmp_path / "folder" / "laser")
+    assert (tmp_path / "folder" / "laser").is_symlink()
+    with serial.Serial(str(link.path), 57600, timeout=1) as host:
+        link.write(b"\x00\r\n\x03\x11\x13\xff")
+        assert host.read(7) == b"\x00\r\n\x03\x11\x13\xff"
+        host.write(b"\r\x04")
+        assert eventually(lambda: link.counters.received_bytes == 2 or link.read() != b"")
+    assert link.read() == b""  # nothing echoed
+    link.close()
+    assert not os.path.lexists(link.path)
+
+
+@pytest.mark.parametrize("baud", [9600, 19200, 115200, 250000, 500000, 750000])
+def test_line_speed_of_the_host_is_seen(tmp_path: Path, baud: int) -> None:
+    link = PtyLink(tmp_path / "p")
+    with serial.Serial(str(link.path), baud):
+        assert link.baud == baud
+    link.close()
+    assert link.baud is None
+
+
+def test_full_queue_drops_and_counts(tmp_path: Path) -> None:
+    link = PtyLink(tmp_path / "p")
+    sent = sum(link.write(bytes(1000)) for _ in range(60))
+    assert sent == link.counters.sent_bytes
+    assert 0 < sent < 60_000
+    assert link.counters.dropped_bytes == 60_000 - sent
+    link.close()
+
+
+def test_replug_is_a_new_terminal_under_the_old_name(tmp_path: Path) -> None:
+    link = PtyLink(tmp_path / "p")
+    host = serial.Serial(str(link.path), timeout=0.2)
+    link.close()
+    with pytest.raises((serial.SerialException, OSError)):
+        host.read(1)
+    with pytest.raises(serial.SerialException):
+        serial.Serial(str(link.path))
+    link.open()
+    link.open()
+    with serial.Serial(str(link.path), timeout=1) as again:
+        link.write(b"back")
+        assert again.read(4) == b"back"
+    host.close()
+    link.close()
+    link.close()
+
+
+def test_stale_link_is_replaced_and_a_foreign_file_is_not(tmp_path: Path) -> None:
+    (tmp_path / "stale").symlink_to("/dev/pts/nowhere")
+    PtyLink(tmp_path / "stale").close()
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(FileExistsError, match="choose another folder"):
+        PtyLink(tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_closing_leaves_a_name_that_another_took_over(tmp_path: Path) -> None:
+    first = PtyLink(tmp_path / "p")
+    second = PtyLink(tmp_path / "p")
+    first.close()
+    assert os.readlink(tmp_path / "p") == second.tty
+    second.close()
+
+
+def test_busy_and_forbidden_ports(tmp_path: Path) -> None:
+    link = PtyLink(tmp_path / "p")
+    link.obstruct(busy=True, denied=True)
+    with pytest.raises((serial.SerialException, OSError)):
+        serial.Serial(str(link.path), exclusive=True)
+    assert stat.S_IMODE(os.stat(str(link.tty)).st_mode) == 0
+    link.obstruct(busy=False, denied=False)
+    serial.Serial(str(link.path), exclusive=True).close()
+    link.close()
+
+
+def test_rename(tmp_path: Path) -> None:
+    link = PtyLink(tmp_path / "ttyACM")
+    link.rename("1")
+    link.open()
+    assert not os.path.lexists(tmp_path / "ttyACM")
+    assert (tmp_path / "ttyACM1").is_symlink()
+    link.rename("")
+    link.open()
+    assert (tmp_path / "ttyACM").is_symlink()
+    link.close()
+
+
+# -- memory and TCP ---------------------------------------------------------------------------------------------------
+
+
+def test_memory_link_breaks_when_unplugged() -> None:
+    link = MemoryLink()
+    link.host_write(b"ab")
+    assert link.read() == b"ab"
+    link.write(b"cd")
+    link.close()
+    with pytest.raises(BrokenPipeError):
+        link.host_read()
+    with pytest.raises(BrokenPipeError):
+        link.host_write(b"x")
+    assert link.write(b"xyz") == 0
+    assert link.counters.dropped_bytes == 3
+    link.open()
+    assert link.host_read() == b""
+
+
+def test_tcp_serves_one_host_at_a_time_and_tells_the_device_when_it_goes() -> None:
+    link, device = TcpLink(port=0), Upper()
+    with_loop = Attachment()
+    with_loop.add("device", device, link)
+    with with_loop:
+        with socket.create_connection((link.host, link.port), 2) as host:
+            host.sendall(b"hello")
+            assert host.recv(10) == b"HELLO"
+            with socket.create_connection((link.host, link.port), 2) as second:
+                assert second.recv(1) == b""
+            host.sendall(b"still")
+            assert host.recv(10) == b"STILL"
+        assert eventually(lambda: device.lost == 1)
+        with socket.create_connection((link.host, link.port), 2) as host:
+            host.sendall(b"again")
+            assert host.recv(10) == b"AGAIN"
+            with_loop.unplug("device")
+            assert host.recv(1) == b""
+        assert eventually(lambda: not link.is_open)
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection((link.host, link.port), 2)
+        with_loop.replug("device")
+        assert eventually(lambda: link.is_open)
+        with socket.create_connection((link.host, link.port), 2) as host:
+            host.sendall(b"x")
+            assert host.recv(1) == b"X"
+
+
+# -- the loop ---------------------------------------------------------------------------------------------------------
+
+
+def test_loop_answers_at_once_and_sleeps_between(tmp_path: Path) -> None:
+    device = Upper()
+    loop = Attachment()
+    loop.add("device", device, PtyLink(tmp_path / "p"))
+    with loop, serial.Serial(str(tmp_path / "p"), 19200, timeout=1) as host:
+        host.write(b"warm")
+        assert host.read(4) == b"WARM"
+        steps = len(device.bauds)
+        time.sleep(0.3)
+        assert len(device.bauds) - steps < 20
+        delays = []
+        for _ in range(20):
+            begin = time.monotonic()
+            host.write(b"q")
+            assert host.read(1) == b"Q"
+            delays.append(time.monotonic() - begin)
+        assert sorted(delays)[10] < 0.01
+        assert device.bauds[-1] == 19200
+
+
+def test_device_is_stepped_when_it_asks_for_it() -> None:
+    class Metronome:
+        def __init__(self) -> None:
+            self.ticks: list[int] = []
+            self.next_ns = 0
+
+        def step(self, now_ns: int, received: bytes, baud: int | None = None) -> bytes:
+            if now_ns >= self.next_ns:
+                self.ticks.append(now_ns)
+                self.next_ns = now_ns + 5_000_000
+            return b""
+
+    device = Metronome()
+    loop = Attachment()
+    loop.add("metronome", device, MemoryLink())
+    end = time.monotonic() + 0.5
+    loop.run(lambda: time.monotonic() > end)
+    assert 60 <= len(device.ticks) <= 101
+    loop.stop()
+
+
+def test_simulated_time_runs_at_its_speed() -> None:
+    now = [1_000]
+    loop = Attachment(clock=lambda: now[0], speed=10.0)
+    now[0] += 50
+    assert loop.now_ns() == 1_500
+    loop.stop()
+    with pytest.raises(ValueError, match="speed"):
+        Attachment(speed=0.0)
+
+
+def test_posted_work_runs_in_the_loops_thread() -> None:
+    loop, names = Attachment(), []
+    with loop:
+        done = threading.Event()
+        loop.post(lambda: names.append(threading.current_thread().name))
+        loop.post(done.set)
+        assert done.wait(2.0)
+    assert names == ["attachment"]
+
+
+def is_unplugged(link: MemoryLink) -> bool:
+    return not link.is_open
+
+
+def test_device_may_pull_its_own_plug_and_a_person_too() -> None:
+    loop, link, device = Attachment(), MemoryLink(), Upper()
+    station = loop.add("device", device, link)
+    device.plugged = False
+    loop.service(0)
+    assert is_unplugged(link)
+    station.plug(False)
+    device.plugged = True
+    loop.service(1)
+    assert is_unplugged(link)
+    station.plug(True)
+    loop.service(2)
+    assert not is_unplugged(link)
+    loop.stop()
+
+
+def test_bug_in_a_device_reaches_whoever_stops_the_loop() -> None:
+    class Broken:
+        def step(self, now_ns: int, received: bytes, baud: int | None = None) -> bytes:
+            raise ZeroDivisionError("bug")
+
+    loop = Attachment()
+    loop.add("broken", Broken(), MemoryLink())
+    loop.start()
+    time.sleep(0.05)
+    with pytest.raises(ZeroDivisionError):
+        loop.stop()
+
+
+def test_names_are_unique() -> None:
+    loop = Attachment()
+    loop.add("one", Upper(), MemoryLink())
+    with pytest.raises(ValueError, match="one"):
+        loop.add("one", Upper(), MemoryLink())
+    loop.stop()
+
+
+def test_terminal_settings_of_a_host_do_not_leak_echo(tmp_path: Path) -> None:
+    link = PtyLink(tmp_path / "p")
+    with serial.Serial(str(link.path)) as host:
+        flags = termios.tcgetattr(host.fileno())[3]
+        assert not flags & (termios.ECHO | termios.ICANON)
+    link.close()
