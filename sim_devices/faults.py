@@ -593,7 +593,7 @@ class FaultyByteDevice:
         self._target = target
         self._knobs = _Knobs(device, plan, target)
         self._random = plan.random(target)
-        self._now_ns = 0
+        self._now_ns: int | None = None
         self._was_off = False
         self._dark_until_ns: int | None = None
         self._browned: list[Fault] = []
@@ -605,7 +605,8 @@ class FaultyByteDevice:
         """Step the device and carry out what its faults do to the bytes."""
         self._plan.begin(now_ns)
         faults = {fault.kind: fault for fault in reversed(self._knobs.follow(now_ns))}
-        elapsed_ns, self._now_ns = now_ns - self._now_ns, now_ns
+        elapsed_ns = 0 if self._now_ns is None else now_ns - self._now_ns
+        self._now_ns = now_ns
         self._follow_port(faults)
         if self._is_dark(faults, now_ns):
             return b""
@@ -620,10 +621,11 @@ class FaultyByteDevice:
     @property
     def next_ns(self) -> int | None:
         """When the device, the next change of its faults, or held-back bytes want to be served."""
-        due = [self._plan.next_change_ns(self._target, self._now_ns), self._dark_until_ns]
-        due.append(getattr(self.inner, "next_ns", self._now_ns + STEP_NS))
-        if self._backlog or self._plan.active(self._target, "flood", self._now_ns):
-            due.append(self._now_ns + STEP_NS // 4)
+        now_ns = self._now_ns or 0
+        due = [self._plan.next_change_ns(self._target, now_ns), self._dark_until_ns]
+        due.append(getattr(self.inner, "next_ns", now_ns + STEP_NS))
+        if self._backlog or self._plan.active(self._target, "flood", now_ns):
+            due.append(now_ns + STEP_NS // 4)
         due += [at_ns for at_ns, _ in self._late[:1]]
         return min((at_ns for at_ns in due if at_ns is not None), default=None)
 
@@ -719,7 +721,7 @@ class FaultyNode:
         self._target = target
         self._knobs = _Knobs(node, plan, target)
         self._random = plan.random(target)
-        self._now_ns = 0
+        self._now_ns: int | None = None
         self._was_off = False
         self._dark_until_ns: int | None = None
         self._browned: list[Fault] = []
@@ -729,7 +731,8 @@ class FaultyNode:
         """Step the node and carry out what its faults do to its frames."""
         self._plan.begin(now_ns)
         faults = {fault.kind: fault for fault in reversed(self._knobs.follow(now_ns))}
-        elapsed_ns, self._now_ns = now_ns - self._now_ns, now_ns
+        elapsed_ns = 0 if self._now_ns is None else now_ns - self._now_ns
+        self._now_ns = now_ns
         if self._is_dark(faults, now_ns):
             return []
         cut = "unplug" in faults
@@ -747,11 +750,12 @@ class FaultyNode:
     @property
     def next_ns(self) -> int | None:
         """When the node, the next change of its faults, or held-back frames want to be served."""
-        due = [self._plan.next_change_ns(self._target, self._now_ns), self._dark_until_ns]
-        due.append(getattr(self.inner, "next_ns", self._now_ns + STEP_NS))
-        due += [max(at_ns, self._now_ns + STEP_NS) for at_ns, _ in self._held[:1]]
-        if self._plan.active(self._target, "flood", self._now_ns):
-            due.append(self._now_ns + STEP_NS)
+        now_ns = self._now_ns or 0
+        due = [self._plan.next_change_ns(self._target, now_ns), self._dark_until_ns]
+        due.append(getattr(self.inner, "next_ns", now_ns + STEP_NS))
+        due += [max(at_ns, now_ns + STEP_NS) for at_ns, _ in self._held[:1]]
+        if self._plan.active(self._target, "flood", now_ns):
+            due.append(now_ns + STEP_NS)
         return min((at_ns for at_ns in due if at_ns is not None), default=None)
 
     def _is_dark(self, faults: Mapping[str, Fault], now_ns: int) -> bool:
