@@ -225,8 +225,9 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
 
 
 def _sector_maps(config: Config) -> Iterator[SectorLayer]:
-    from mapping.sectors.polar import PolarSectors
     from mapping.sectors.rectangular import RectSectors
+
+    from mapping.sectors.polar import PolarSectors
     from service.layers import PolarLayer, RectLayer
 
     footprint = np.array(config.robot.footprint_m)

@@ -69,7 +69,7 @@ class Daemon:
 
     def run(self) -> int:
         """Start, wait for SIGINT or SIGTERM, stop; returns the exit code. Trouble if it cannot start."""
-        faulthandler.enable()
+        faulthandler.enable(file=sys.__stderr__ or sys.stderr)
         with _signals(self._stop_asked.set):
             try:
                 self.start()
@@ -343,7 +343,7 @@ def _exit_deadline(seconds: float) -> Iterator[None]:
 
     def end() -> None:
         print(f"umfeld: not stopped within {seconds:.0f} s, ending now; the threads were at:", file=sys.stderr)
-        faulthandler.dump_traceback(file=sys.stderr)
+        faulthandler.dump_traceback(file=sys.__stderr__ or sys.stderr)
         os._exit(1)
 
     timer = threading.Timer(seconds, end)

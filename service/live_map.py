@@ -101,6 +101,8 @@ class LiveMap:
             tiles = saved.load_tiles(GRID)
             ready_made = saved.load_tiles(OCCUPANCY)
             check_fits(self._layer.grid, saved)
+        if not tiles:
+            raise CallRefused(f"{path}: holds no grid to go on with; `umfeld map import` makes one from a picture")
         self._check_tiles(path, tiles)
         self.snapshot()  # so that nothing older waits behind what is written next
         self._ask(lambda: replace_tiles(self._layer, tiles))

@@ -47,7 +47,7 @@ class Claims:
         address = "\0umfeld/" + kind + "/" + hashlib.sha256(name.encode()).hexdigest()[:32]
         try:
             holder.bind(address)
-            holder.listen(1)
+            holder.listen(1024)  # nobody accepts: every refused daemon takes a place
         except OSError as error:
             holder.close()
             raise Trouble(refusal.format(pid=_holder_of(address))) from error

@@ -1,0 +1,425 @@
+"""The parts around fusion: its thread, the locks, the live map on disk, sd_notify, clocks."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.readings import DeviceEvent, LinkState, ScanReading
+from mapping.frames import Pose2
+from mapping.grids.occupancy import OccupancyGrid
+from mapping.grids.patch import GridPatch
+from service.clock import CrankedClock, SystemClock
+from service.daemon import Daemon, network_settings
+from service.errors import Trouble
+from service.fusion import Fusion, Parts
+from service.layers import BuildingLayer
+from service.live_map import GRID, LiveMap, restore
+from service.locks import Claims
+from service.outputs import GridOut, GridUpdateOut, HealthOut, Output, ScanOut
+from service.rpc import CallRefused
+from service.sensors import Laser
+from service.store import MapStore, occupancy_patch
+from service.systemd import Notifier
+from service.worker import Worker
+
+SECOND = 1_000_000_000
+
+
+def scan(stamp_ns: int) -> ScanReading:
+    return ScanReading(stamp_ns, 0.0, 100_000_000, np.linspace(-1, 1, 21), np.full(21, 2.0), 0.1, 10.0)
+
+
+# --- the fusion thread
+
+
+class Office:
+    """A worker with a cranked clock and what it put out."""
+
+    def __init__(self) -> None:
+        self.clock = CrankedClock(SECOND)
+        self.told: list[Output] = []
+        self.beats: list[int] = []
+        self.fusion = Fusion(Parts(sensors={"front": Laser("front", Pose2())}))
+        self.worker = Worker(
+            self.fusion,
+            self.told.append,
+            now_ns=self.clock.now_ns,
+            beat=self.beats.append,
+            health=lambda now_ns: HealthOut(now_ns, 0, "", (), {}, {}),
+        )
+
+
+def test_readings_become_outputs_and_every_turn_beats() -> None:
+    office = Office()
+    office.worker.sink("front", scan(SECOND))
+    office.worker.turn(0.0)
+    assert [type(each) for each in office.told] == [ScanOut, HealthOut]
+    assert office.beats == [SECOND]
+
+
+def test_health_comes_every_second_and_at_once_when_a_device_changes() -> None:
+    office = Office()
+
+    def told_at() -> list[int]:
+        return [each.stamp_ns // 1_000_000 for each in office.told if isinstance(each, HealthOut)]
+
+    for _ in range(30):
+        office.worker.turn(0.0)
+        office.clock.turn(100_000_000)
+    assert told_at() == [1000, 2000, 3000]
+    office.worker.sink("front", DeviceEvent(office.clock.now_ns(), LinkState.ABSENT, "gone"))
+    office.worker.turn(0.0)
+    assert told_at()[-1] == 4000
+    office.clock.turn(20_000_000)
+    office.worker.sink("front", DeviceEvent(office.clock.now_ns(), LinkState.ABSENT, "gone"))
+    office.worker.turn(0.0)
+    assert told_at()[-1] == 4000  # a device that flutters does not flood
+    office.clock.turn(80_000_000)
+    office.worker.turn(0.0)
+    assert told_at()[-1] == 4100
+
+
+def test_a_bug_costs_one_reading_not_the_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
+    office = Office()
+    good = office.fusion.on_item
+    monkeypatch.setattr(office.fusion, "on_item", lambda *_: 1 / 0)
+    office.worker.sink("front", scan(SECOND))
+    office.worker.turn(0.0)
+    monkeypatch.setattr(office.fusion, "on_item", good)
+    office.worker.sink("front", scan(2 * SECOND))
+    office.worker.turn(0.0)
+    assert office.worker.counters()["fusion.errors"] == 1
+    assert sum(isinstance(each, ScanOut) for each in office.told) == 1
+
+
+def test_others_ask_between_readings_and_get_results_and_errors() -> None:
+    office = Office()
+    clock = SystemClock()
+    worker = Worker(
+        office.fusion,
+        office.told.append,
+        now_ns=clock.now_ns,
+        beat=lambda _: None,
+        health=lambda now_ns: HealthOut(now_ns, 0, "", (), {}, {}),
+    )
+    worker.start()
+    try:
+        assert worker.ask(threading.current_thread).name == "fusion"
+        with pytest.raises(ZeroDivisionError):
+            worker.ask(lambda: 1 // 0)
+    finally:
+        assert worker.stop(5.0)
+    assert worker.ask(lambda: 7) == 7  # after the thread has ended the maps belong to whoever asks
+
+
+def test_a_flood_is_bounded_and_counted_but_events_survive(monkeypatch: pytest.MonkeyPatch) -> None:
+    office = Office()
+    office.worker.sink("front", DeviceEvent(0, LinkState.SILENT, "silent"))
+    for number in range(5000):
+        office.worker.sink("front", scan(number))
+    counters = office.worker.counters()
+    assert counters["queue.depth"] <= 2048
+    assert counters["queue.dropped.front"] == 5001 - counters["queue.depth"]
+    seen: list[object] = []
+
+    def remember(_source: str, item: object, _now_ns: int) -> list[Output]:
+        seen.append(item)
+        return []
+
+    monkeypatch.setattr(office.fusion, "on_item", remember)
+    office.worker.turn(0.0)
+    assert isinstance(seen[0], DeviceEvent)
+
+
+# --- locks
+
+
+def test_a_port_belongs_to_one_daemon(tmp_path: Path) -> None:
+    port = tmp_path / "tty"
+    alias = tmp_path / "alias"
+    alias.symlink_to(port)
+    with Claims() as first, Claims() as second:
+        first.claim_ports([str(port)])
+        for _ in range(5):
+            with pytest.raises(Trouble, match=f"process {os.getpid()}\\).*port of its own"):
+                second.claim_ports([str(alias)])
+    with Claims() as third:
+        third.claim_ports([str(alias)])
+
+
+def test_a_killed_daemon_leaves_no_lock(tmp_path: Path) -> None:
+    code = """
+import sys, time
+from service.locks import Claims
+claims = Claims()
+claims.claim_ports(sys.argv[1:])
+print("held", flush=True)
+time.sleep(60)
+"""
+    holder = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "tty")], stdout=subprocess.PIPE)
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == b"held\n"
+    with Claims() as claims:
+        with pytest.raises(Trouble, match=f"process {holder.pid}"):
+            claims.claim_ports([str(tmp_path / "tty")])
+        holder.kill()
+        holder.wait()
+        holder.stdout.close()
+        claims.claim_ports([str(tmp_path / "tty")])
+
+
+# --- the live map
+
+
+def building(**changes: float) -> BuildingLayer:
+    grid = OccupancyGrid(resolution_m=changes.get("resolution_m", 0.05))
+    return BuildingLayer(grid, {"front"}, publish_period_ns=SECOND, update_period_ns=SECOND // 5)
+
+
+def draw(layer: BuildingLayer, x_m: float, y_m: float = 0.0) -> None:
+    pose = Pose2(x_m, y_m)
+    for _ in range(3):
+        layer.grid.insert_scan(pose, np.linspace(-3, 3, 361), np.full(361, 2.0), range_max_m=10.0)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[MapStore]:
+    with MapStore.open(tmp_path / "live.umfeld", wall_ns=lambda: 1) as opened:
+        yield opened
+
+
+def live(layer: BuildingLayer, store: MapStore | None, pose: Pose2 | None = None) -> LiveMap:
+    return LiveMap(layer, store, ask=lambda work: work(), pose=lambda: pose)
+
+
+def test_a_map_comes_back_as_it_was_left_and_the_robot_where_it_stood(store: MapStore) -> None:
+    layer = building()
+    draw(layer, 0.0)
+    draw(layer, 30.0, -5.0)
+    assert live(layer, store, Pose2(30.0, -5.0, 1.0)).snapshot()
+    again = building()
+    assert restore(again.grid, store) == Pose2(30.0, -5.0, 1.0)
+    assert list(again.grid.tiles()) == list(layer.grid.tiles())
+    np.testing.assert_array_equal(occupancy_patch(store).cells, layer.grid.patch().cells)
+
+
+def test_a_snapshot_writes_only_what_changed(store: MapStore) -> None:
+    layer = building()
+    keeper = live(layer, store)
+    draw(layer, 0.0)
+    assert keeper.snapshot()
+    before = keeper.counters()["store_tiles"]
+    assert keeper.snapshot()
+    assert keeper.counters()["store_tiles"] == before
+    draw(layer, 50.0)
+    assert keeper.snapshot()
+    assert 0 < keeper.counters()["store_tiles"] - before <= 2 * 4
+
+
+def test_a_map_of_another_resolution_is_refused_with_the_setting_to_change(store: MapStore) -> None:
+    layer = building()
+    draw(layer, 0.0)
+    live(layer, store).snapshot()
+    with pytest.raises(Trouble, match=r"resolution_m 0.05, the configuration 0.1; set resolution_m in \[grid\]"):
+        restore(building(resolution_m=0.1).grid, store)
+
+
+def test_saving_and_loading_by_name(store: MapStore) -> None:
+    layer = building()
+    keeper = live(layer, store, Pose2())
+    draw(layer, 0.0)
+    receipt = keeper.save("kitchen")
+    assert Path(str(receipt["path"])) == store.path.parent / "kitchen.umfeld"
+    kitchen = layer.grid.patch()
+    draw(layer, 40.0)
+    assert layer.grid.patch().cells.shape != kitchen.cells.shape
+    assert keeper.load("kitchen")["tiles"] == len(store.load_tiles(GRID))
+    np.testing.assert_array_equal(layer.grid.patch().cells, kitchen.cells)
+    np.testing.assert_array_equal(occupancy_patch(store).cells, kitchen.cells)
+    assert {each["name"] for each in keeper.list()["maps"]} == {"kitchen", "live"}
+    assert keeper.info()["occupied_cells"] > 10
+    with pytest.raises(Trouble, match="kitche"):
+        keeper.load("kitche")
+    with pytest.raises(CallRefused, match="live map itself"):
+        keeper.load("live")
+
+
+def test_a_torn_map_is_not_loaded_and_the_live_one_stays(store: MapStore) -> None:
+    layer = building()
+    keeper = live(layer, store)
+    draw(layer, 0.0)
+    with MapStore.open(store.path.parent / "torn.umfeld", wall_ns=lambda: 1) as torn:
+        tiles = list(layer.grid.tiles())
+        row, column, payload = tiles[-1]
+        torn.snapshot({GRID: [*tiles[:-1], (row, column, payload[:-9])]})
+    before = layer.grid.patch()
+    with pytest.raises(CallRefused, match=r"torn.*live map is as it was"):
+        keeper.load("torn")
+    np.testing.assert_array_equal(layer.grid.patch().cells, before.cells)
+
+
+def test_without_a_store_calls_are_refused_in_words() -> None:
+    keeper = live(building(), None)
+    assert keeper.snapshot()
+    with pytest.raises(CallRefused, match=r"\[store\] enabled"):
+        keeper.save("x")
+
+
+# --- what of the grid is published when
+
+
+class Mirror:
+    """A client: takes full grids, applies updates of the same epoch, and minds the rules."""
+
+    def __init__(self) -> None:
+        self.full = GridPatch(0.05, 0, 0, np.full((1, 1), -1, dtype=np.int8))
+        self.epoch = 0
+        self.full_ns: list[int] = []
+
+    def take(self, output: Output, now_ns: int) -> None:
+        assert isinstance(output, GridOut | GridUpdateOut)
+        patch = output.patch
+        if isinstance(output, GridOut):
+            assert output.epoch == self.epoch + 1
+            self.epoch, self.full = output.epoch, GridPatch(0.05, patch.row0, patch.col0, patch.cells.copy())
+            self.full_ns.append(now_ns)
+            return
+        assert output.epoch == self.epoch
+        row, col = patch.row0 - self.full.row0, patch.col0 - self.full.col0
+        assert row >= 0
+        assert col >= 0
+        target = self.full.cells[row : row + patch.cells.shape[0], col : col + patch.cells.shape[1]]
+        assert target.shape == patch.cells.shape
+        target[:] = patch.cells
+
+
+def test_a_client_that_applies_updates_has_the_grid() -> None:
+    layer, mirror = building(), Mirror()
+    rng = np.random.default_rng(1)
+    now_ns = 0
+    for step in range(60):
+        now_ns += 150_000_000
+        if step % 3:
+            draw(layer, float(rng.uniform(-3, 3)) + step * 0.2)
+        for output in layer.outputs(None, now_ns, now_ns):
+            mirror.take(output, now_ns)
+    now_ns += 2 * SECOND
+    for output in layer.outputs(None, now_ns, now_ns):
+        mirror.take(output, now_ns)
+    assert np.diff(mirror.full_ns).min() >= SECOND
+    truth = layer.grid.patch(whole_tiles=True)
+    assert (truth.row0, truth.col0) == (mirror.full.row0, mirror.full.col0)
+    np.testing.assert_array_equal(truth.cells, mirror.full.cells)
+
+
+def test_a_grid_that_does_not_change_is_not_sent_again() -> None:
+    layer = building()
+    assert layer.outputs(None, 0, 0) == []
+    draw(layer, 0.0)
+    assert [type(each) for each in layer.outputs(None, 0, SECOND)] == [GridOut]
+    assert [layer.outputs(None, 0, n * SECOND) for n in range(2, 20)] == [[]] * 18
+
+
+# --- systemd
+
+
+def test_the_service_manager_hears_ready_beats_and_stopping(tmp_path: Path) -> None:
+    address = tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(address))
+        manager.settimeout(1.0)
+        notifier = Notifier({"NOTIFY_SOCKET": str(address), "WATCHDOG_USEC": "10000000"})
+        assert notifier.watched
+        notifier.ready("4 devices")
+        assert manager.recv(4096) == b"READY=1\nSTATUS=4 devices"
+        for now_s in (0, 1, 4, 6, 7, 11):
+            notifier.beat(now_s * SECOND)
+        notifier.stopping("bye")
+        heard = [manager.recv(4096) for _ in range(4)]
+        assert heard == [b"WATCHDOG=1"] * 3 + [b"STOPPING=1\nSTATUS=bye"]
+
+
+def test_an_abstract_address_and_a_deaf_manager() -> None:
+    name = f"@umfeld-test-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind("\0" + name[1:])
+        manager.settimeout(1.0)
+        Notifier({"NOTIFY_SOCKET": name}).status("x")
+        assert manager.recv(100) == b"STATUS=x"
+    Notifier({"NOTIFY_SOCKET": name}).status("nobody listens")
+    Notifier({}).ready("nobody ever did")
+
+
+def test_a_watchdog_for_another_process_is_not_ours() -> None:
+    assert not Notifier({"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}).watched
+    assert Notifier({"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": str(os.getpid())}).watched
+    assert not Notifier({"WATCHDOG_USEC": "soon"}).watched
+
+
+# --- clocks
+
+
+def test_the_system_clocks_agree_with_the_system() -> None:
+    import time
+
+    clock = SystemClock()
+    before = time.time_ns()
+    wall = clock.wall_from_monotonic_ns(clock.now_ns())
+    assert before - 5_000_000 <= wall <= time.time_ns() + 5_000_000
+
+
+def test_a_cranked_clock_moves_when_turned() -> None:
+    clock = CrankedClock(5, wall_offset_ns=100)
+    assert clock.turn(7) == clock.now_ns() == 12
+    assert clock.wall_from_monotonic_ns(12) == 112
+    with pytest.raises(ValueError):
+        clock.turn(-1)
+
+
+# --- configuration of the router
+
+
+def test_the_router_is_set_up_as_configured() -> None:
+    from service.config import Config
+
+    config = Config.model_validate(
+        {
+            "network": {
+                "listen": ("tls/0.0.0.0:7447",),
+                "connect": ("tls/fleet:7447",),
+                "tls": {"root_ca_certificate": "a", "listen_certificate": "b", "listen_private_key": "c"},
+                "config": "~/zenoh.json5",
+            }
+        }
+    )
+    settings = network_settings(config)
+    assert (settings.listen, settings.connect) == (("tls/0.0.0.0:7447",), ("tls/fleet:7447",))
+    assert settings.tls is not None
+    assert (settings.tls.root_ca_certificate, settings.tls.private_key, settings.tls.mutual) == ("a", "c", True)
+    assert settings.zenoh_config == Path.home() / "zenoh.json5"
+
+
+def test_a_start_that_fails_gives_everything_back(tmp_path: Path) -> None:
+    from service.config import load
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen(1)
+        file = tmp_path / "umfeld.toml"
+        file.write_text(
+            f'[network]\nlisten = ["tcp/127.0.0.1:{taken.getsockname()[1]}"]\n[store]\npath = "{tmp_path}/m.umfeld"\n'
+            f'[lasers.front]\ndriver = "hokuyo"\nport = "{tmp_path}/tty"\n'
+        )
+        with pytest.raises(Trouble, match="in use"):
+            Daemon(load(file, environment={})).start()
+    with Claims() as claims, MapStore.open(tmp_path / "m.umfeld", wall_ns=lambda: 1):
+        claims.claim_ports([f"{tmp_path}/tty"])
