@@ -33,7 +33,12 @@ def write_imported_map(patch: GridPatch, path: Path, *, source: str, model: Lite
         raise MapFileTrouble(f"{source}: {error}; move its origin nearer to the map's") from error
     if grid.refused_tiles:
         raise MapFileTrouble(f"{source}: is too large for one map; cut it or use a coarser --resolution")
-    properties = {"resolution_m": patch.resolution_m, "model": model, "tile_cells": TILE}
+    return write_grid_map(grid, path, source=source)
+
+
+def write_grid_map(grid: OccupancyGrid, path: Path, *, source: str) -> Receipt:
+    """A grid as a map file: what exports read, and the tiles from which a daemon restores it; replaces path whole."""
+    properties = {"resolution_m": grid.resolution_m, "model": grid.model, "tile_cells": TILE}
     return write_occupancy_map(
         grid.patch(), path, source=source, tile_cells=TILE, layers={"grid": grid.tiles()}, meta={"grid": properties}
     )

@@ -26,6 +26,13 @@ class Model(StrEnum):
     LOG_ODDS = "log-odds"
 
 
+class Poses(StrEnum):
+    """Where the poses of a log's scans come from."""
+
+    LOG = "log"
+    ODOMETRY = "odometry"
+
+
 Connect = Annotated[str | None, typer.Option(help="The daemon's endpoint; default: that of the configuration.")]
 Config = Annotated[Path | None, typer.Option("--config", "-c", help="The daemon's configuration file.")]
 Robot = Annotated[str | None, typer.Option(help="The robot's id, where several answer.")]
@@ -196,6 +203,44 @@ def import_map(
     patch = patch_of(load_pgm_yaml(source), resolution)
     receipt = write_imported_map(patch, out, source=source.name, model=model.value)
     _report(receipt.document(), as_json)
+
+
+@app.command()
+def build(
+    log: Annotated[Path, typer.Argument(help="A recorded log.")],
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for the results; made if absent.")],
+    poses: Annotated[
+        Poses, typer.Option(help="log: as the log has them; odometry: only if they are odometry.")
+    ] = Poses.LOG,
+    every: Annotated[int, typer.Option(min=1, help="Use every N-th scan.")] = 1,
+    hold_out: Annotated[int, typer.Option(min=0, help="Keep every N-th scan back and judge the grid by it.")] = 0,
+    resolution: Annotated[float, typer.Option(min=0.005, max=1.0, help="Metres a cell.")] = 0.05,
+    model: Annotated[Model, typer.Option(help="How cells count.")] = Model.COUNTERS,
+    as_json: AsJson = False,
+) -> None:
+    """Map a recorded log offline: trajectory, grid in every form, report.
+
+    Example: umfeld map build seattle-corrected.log.gz --out seattle --hold-out 10
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from service import map_build
+
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(log.name, total=None)
+        built = map_build.build(
+            log,
+            poses=map_build.PoseSource(poses.value),
+            every=every,
+            hold_out=hold_out,
+            resolution_m=resolution,
+            model=model.value,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    _report(map_build.write(built, out, source=map_build.PoseSource(poses.value)), as_json)
 
 
 def _client(connect: str | None, config: Path | None) -> Client:
