@@ -7,6 +7,7 @@ from collections import OrderedDict
 from collections.abc import Hashable
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 from typing import Final, Literal
 
 import numpy as np
@@ -499,6 +500,7 @@ def _rule_numbers(model: Model, rules: CellRules) -> I64:
     )
 
 
+@cache
 def _probabilities_of_cells(model: Model) -> F64:
     """(65536,) probability of each content of a cell, NaN unknown."""
     value = np.arange(1 << 16)
@@ -510,6 +512,7 @@ def _probabilities_of_cells(model: Model) -> F64:
     return np.where(value == 0, np.nan, 1.0 / (1.0 + np.exp(-odds)))
 
 
+@cache
 def _probabilities_of_sonar() -> F64:
     """(256,) the same for the sonar layer."""
     value = np.arange(256)
