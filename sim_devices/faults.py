@@ -623,8 +623,10 @@ class FaultyByteDevice:
         """When the device, the next change of its faults, or held-back bytes want to be served."""
         now_ns = self._now_ns or 0
         due = [self._plan.next_change_ns(self._target, now_ns), self._dark_until_ns]
-        due.append(getattr(self.inner, "next_ns", now_ns + STEP_NS))
-        if self._backlog or self._plan.active(self._target, "flood", now_ns):
+        if not self._was_off:
+            due.append(getattr(self.inner, "next_ns", now_ns + STEP_NS))
+        held = self._plan.active(self._target, "stall", now_ns) is not None
+        if (self._backlog and not held) or self._plan.active(self._target, "flood", now_ns):
             due.append(now_ns + STEP_NS // 4)
         due += [at_ns for at_ns, _ in self._late[:1]]
         return min((at_ns for at_ns in due if at_ns is not None), default=None)
@@ -752,7 +754,8 @@ class FaultyNode:
         """When the node, the next change of its faults, or held-back frames want to be served."""
         now_ns = self._now_ns or 0
         due = [self._plan.next_change_ns(self._target, now_ns), self._dark_until_ns]
-        due.append(getattr(self.inner, "next_ns", now_ns + STEP_NS))
+        if not self._was_off:
+            due.append(getattr(self.inner, "next_ns", now_ns + STEP_NS))
         due += [max(at_ns, now_ns + STEP_NS) for at_ns, _ in self._held[:1]]
         if self._plan.active(self._target, "flood", now_ns):
             due.append(now_ns + STEP_NS)

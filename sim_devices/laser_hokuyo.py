@@ -18,6 +18,7 @@ What this emulator does that a naive one would not:
 - SS answers at the old rate and changes after the reply has left. At a wrong rate the host reads noise; what it sends
   is lost to framing errors.
 - Before the motor is up to speed streams are accepted and wait; GD is held back until a first scan exists.
+- RB twice: the answers still leave, then the device is deaf for half a second and starts from scratch.
 - An empty line is not answered. A second measuring command replaces the stream that runs.
 - Assumed, the papers being silent: distances past 4095 mm are clipped in MS and GS; a start before AMIN is allowed and
   gives "not measurable"; HD, HE, ND and NE are unknown commands on these models (0E).
@@ -46,6 +47,7 @@ USB_RATE_BPS = 8_000_000  # full-speed CDC moves about 0.8 MB/s
 TCP_RATE_BPS = 100_000_000
 BLOCK = 64
 ALWAYS_OBEYED = frozenset((b"TM", b"QT", b"RS", b"RT", b"%ST"))  # in time mode, too
+REBOOT_S = 0.5
 REBOOT_WINDOW_NS = SECOND_NS
 MAX_RANGE_2_CHARS = 4095
 
@@ -337,10 +339,12 @@ class HokuyoLaser:
             return b""
         fits = self.link != "rs232" or baud is None or baud == self._wire.rate_bps
         self._finish_sweeps(now_ns)
-        if fits and received:
+        if fits and received and not self._rebooting:
             self._take(received, now_ns)
             self._finish_sweeps(now_ns)
         out = self._wire.leave_by(now_ns)
+        if self._rebooting and self._wire.is_empty:
+            self.power_on(now_ns, boot_s=REBOOT_S)
         return out if fits else self._garbled(out)
 
     @property
@@ -393,6 +397,7 @@ class HokuyoLaser:
         self._time_mode = False
         self._sensitive = False
         self._reboot_asked_ns: int | None = None
+        self._rebooting = False
         self._last_command = b""
 
     def set_clock_drift(self, ppm: float, now_ns: int) -> None:
@@ -432,7 +437,7 @@ class HokuyoLaser:
         while (end := self._buffer.find(b"\n")) >= 0:
             line = bytes(self._buffer[:end])
             del self._buffer[: end + 1]
-            if line:
+            if line and not self._rebooting:
                 self._obey(line, now_ns)
         if len(self._buffer) > MAX_COMMAND:
             self._buffer.clear()
@@ -654,10 +659,9 @@ class HokuyoLaser:
             self._reboot_asked_ns = now_ns
             self._answer(command + free, "01", now_ns)
             return
-        reply = command + free + b"\n" + sealed(b"00") + b"\n"
-        self.power_on(now_ns, boot_s=0.5)
-        self._boot_done_ns = now_ns  # the reply still leaves; the motor needs its time again
-        self._wire.send(reply, now_ns)
+        self._stop()
+        self._answer(command + free, "00", now_ns)
+        self._rebooting = True
 
     def _simulate_fault(self, command: bytes, free: bytes, now_ns: int) -> None:
         if not self._sized(command, free, 4, now_ns):

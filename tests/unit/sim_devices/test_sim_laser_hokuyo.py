@@ -499,6 +499,8 @@ def test_reboot_forgets_everything_and_motor_starts_again() -> None:
     bench.ask(b"BM\nRB\nRB\n")
     assert not bench.laser.laser_is_on
     assert bench.laser.clock_ms(bench.now_ns) <= 20
+    assert bench.ask(b"QT\n", 0.4) == b""
+    bench.wait(0.1)
     assert b"STAT:Motor is starting up." in bench.ask(b"II\n")
 
 

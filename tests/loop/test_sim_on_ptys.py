@@ -1,0 +1,205 @@
+"""Emulators on real ptys and sockets, met by other people's code: pyserial, python-can, canopen."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+import numpy as np
+import pytest
+import serial
+
+from sim_devices.attach import Attachment, PtyLink
+from sim_devices.device import F64, Mount
+from sim_devices.encoder_cia406 import Cia406Encoder
+from sim_devices.faults import FaultPlan
+from sim_devices.laser_hokuyo import URG_04LX, UTM_30LX, HokuyoLaser
+from sim_devices.slcan_hub import CanBus, CanBusStation
+from sim_devices.sonar_usboard import Transducer, board_with
+
+
+class Room:
+    def beam_ranges(self, mount: Mount, bearing_rad: F64, stamp_ns: F64, range_max_m: float) -> F64:
+        return np.full(len(bearing_rad), 2.0)
+
+    def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
+        return 1.05
+
+    def wheel_travel_m(self, now_ns: int) -> tuple[float, float]:
+        return now_ns * 0.5e-9, now_ns * 0.4e-9
+
+
+def eventually(true: Callable[[], bool], timeout_s: float = 3.0) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not true() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return true()
+
+
+def ask(port: serial.Serial, command: bytes) -> bytes:
+    port.write(command)
+    return bytes(port.read_until(b"\n\n"))
+
+
+# -- laser ------------------------------------------------------------------------------------------------------------
+
+
+def test_forty_scans_a_second_arrive_whole(tmp_path: Path) -> None:
+    loop = Attachment()
+    loop.add("laser", HokuyoLaser(Room(), profile=UTM_30LX, spin_up_s=0.0), PtyLink(tmp_path / "laser"))
+    with loop, serial.Serial(str(tmp_path / "laser"), timeout=1) as port:
+        assert ask(port, b"MD0000108001000\n") == b"MD0000108001000\n00P\n\n"
+        received = bytearray()
+        begin = time.monotonic()
+        while time.monotonic() < begin + 1.0:
+            received += port.read(4096)
+        port.write(b"QT\n")
+        while not received.endswith(b"QT\n00P\n\n"):
+            received += port.read(4096)
+        scans = bytes(received).split(b"\n\n")[:-2]
+        assert {len(scan) for scan in scans} == {3370}
+        assert 35 <= len(scans) <= 44
+
+
+def test_baud_search_finds_the_urg_and_speeds_it_up(tmp_path: Path) -> None:
+    laser = HokuyoLaser(Room(), profile=URG_04LX, start_in_scip1=True, spin_up_s=0.0)
+    loop = Attachment()
+    loop.add("laser", laser, PtyLink(tmp_path / "laser"))
+    with loop, serial.Serial(str(tmp_path / "laser"), 115200, timeout=0.2) as port:
+        answers = {}
+        for baud in (115200, 57600, 19200):
+            port.baudrate = baud
+            time.sleep(0.02)
+            answers[baud] = ask(port, b"QT\n")
+        assert answers == {115200: b"", 57600: b"", 19200: b"QT\nE\n\n"}
+        assert ask(port, b"SCIP2.0\n") == b"SCIP2.0\n0\n\n"
+        assert ask(port, b"SS500000\n") == b"SS500000\n00P\n\n"
+        port.baudrate = 500000
+        time.sleep(0.02)
+        assert ask(port, b"QT\n") == b"QT\n00P\n\n"
+
+
+def test_scripted_unplugging_breaks_and_restores_the_port(tmp_path: Path) -> None:
+    plan = FaultPlan(["laser:unplug@300ms..600ms"])
+    loop = Attachment()
+    loop.add("laser", plan.device("laser", HokuyoLaser(Room(), profile=UTM_30LX)), PtyLink(tmp_path / "laser"))
+    with loop:
+        port = serial.Serial(str(tmp_path / "laser"), timeout=2)
+        assert ask(port, b"QT\n") == b"QT\n00P\n\n"
+        with pytest.raises((serial.SerialException, OSError)):
+            port.read(1)
+        port.close()
+        assert not os.path.lexists(tmp_path / "laser")
+        assert eventually(lambda: os.path.lexists(tmp_path / "laser"))
+        with serial.Serial(str(tmp_path / "laser"), timeout=2) as again:
+            assert ask(again, b"QT\n") == b"QT\n00P\n\n"
+
+
+def test_noise_on_a_pty_is_the_noise_of_the_seed(tmp_path: Path) -> None:
+    plan = FaultPlan(["laser:flip=0.05"], seed=3)
+    loop = Attachment()
+    loop.add("laser", plan.device("laser", HokuyoLaser(Room(), profile=UTM_30LX)), PtyLink(tmp_path / "laser"))
+    with loop, serial.Serial(str(tmp_path / "laser"), timeout=0.05) as port:
+        replies = [ask(port, b"PP\n") for _ in range(10)]
+    assert len(set(replies)) > 5
+
+
+# -- the bus ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bus(tmp_path: Path) -> Iterator[tuple[Attachment, CanBusStation, Path]]:
+    station = CanBusStation(CanBus())
+    for name in ("daemon", "spy"):
+        station.add_member(name, PtyLink(tmp_path / name))
+    for name, node, wheel in (("left", 0x20, "left"), ("right", 0x21, "right")):
+        station.bus.add_node(name, Cia406Encoder(Room(), node, wheel=wheel, boot_s=0.0))  # type: ignore[arg-type]
+    station.bus.add_node("sonar", board_with(0x400, Room(), {1: Transducer(Mount())}, boot_s=0.0))
+    loop = Attachment()
+    loop.add_station("can", station)
+    with loop:
+        yield loop, station, tmp_path
+
+
+def host(path: Path) -> Any:
+    return can.Bus(interface="slcan", channel=str(path), bitrate=1_000_000, sleep_after_open=0)
+
+
+def hear(bus: Any, seconds: float) -> list[can.Message]:
+    heard = []
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        message = bus.recv(left)
+        if message is not None:
+            heard.append(message)
+    return heard
+
+
+def test_python_can_on_both_ends(bus: tuple[Attachment, CanBusStation, Path]) -> None:
+    _, _, folder = bus
+    daemon, spy = host(folder / "daemon"), host(folder / "spy")
+    try:
+        assert daemon.get_version(1.0) == (10, 13)
+        assert daemon.get_serial_number(1.0) == "A123"
+        for number in range(200):
+            daemon.send(can.Message(arbitration_id=0x18FF0000 + number, data=[number % 256] * 8))
+        heard = [one for one in hear(spy, 0.5) if one.is_extended_id]
+        assert [one.arbitration_id - 0x18FF0000 for one in heard] == list(range(200))
+        assert not [one for one in hear(daemon, 0.05) if one.is_extended_id]
+        daemon.send(can.Message(arbitration_id=0x400, data=[13, 1], is_extended_id=False))
+        assert any(one.arbitration_id == 0x40D and one.data.hex() == "0df4d20000000000" for one in hear(spy, 0.2))
+    finally:
+        daemon.shutdown()
+        spy.shutdown()
+
+
+def test_canopen_over_slcan_reads_both_wheels_at_one_sync(bus: tuple[Attachment, CanBusStation, Path]) -> None:
+    _, _, folder = bus
+    network = canopen.Network()
+    network.connect(interface="slcan", channel=str(folder / "daemon"), bitrate=1_000_000, sleep_after_open=0)
+    try:
+        counts: dict[int, int] = {}
+        for node in (0x20, 0x21):
+            empty = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
+            remote: Any = network.add_node(canopen.RemoteNode(node, empty))
+            remote.sdo.RESPONSE_TIMEOUT = 2.0
+            remote.sdo.download(0x1800, 1, struct.pack("<I", 0x80000180 + node))
+            assert remote.sdo.upload(0x1008, 0) == b"UMFELD SIM ENC"
+
+            def note(can_id: int, data: bytearray, _stamp: float) -> None:
+                counts[can_id] = struct.unpack("<I", bytes(data))[0]
+
+            network.subscribe(0x280 + node, note)
+            remote.nmt.state = "OPERATIONAL"
+        network.sync.transmit()
+        assert eventually(lambda: len(counts) == 2)
+        assert counts[0x2A1] / counts[0x2A0] == pytest.approx(0.8, abs=1e-6)
+    finally:
+        network.disconnect()
+
+
+def test_unplugged_adapter_comes_back(bus: tuple[Attachment, CanBusStation, Path]) -> None:
+    loop, _, folder = bus
+    spy = host(folder / "spy")
+    loop.unplug("can", "spy")
+    assert eventually(lambda: not os.path.lexists(folder / "spy"))
+    with pytest.raises(can.CanError):
+        hear(spy, 2.0)
+    with pytest.raises(can.CanError):
+        spy.shutdown()
+    loop.replug("can", "spy")
+    assert eventually(lambda: os.path.lexists(folder / "spy"))
+    again, daemon = host(folder / "spy"), host(folder / "daemon")
+    try:
+        time.sleep(0.05)  # both adapters must be open: python-can waits for no answer
+        daemon.send(can.Message(arbitration_id=0x123, is_extended_id=False))
+        assert any(one.arbitration_id == 0x123 for one in hear(again, 0.3))
+    finally:
+        again.shutdown()
+        daemon.shutdown()
