@@ -7,6 +7,7 @@ with a deadline (a session left open keeps the process alive).
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -161,7 +162,10 @@ def refuse_open_listeners(endpoints: Sequence[str]) -> None:
 def is_loopback(address: str) -> bool:
     """Whether `host:port` names this machine only."""
     host = address.split("?")[0].split("#")[0].rpartition(":")[0].strip("[]")
-    return host in ("localhost", "::1") or host.startswith("127.")
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _explain_open(error: zenoh.ZError, listen: Sequence[str]) -> NetworkTrouble:
