@@ -343,9 +343,9 @@ def _set_heartbeat() -> Generator[Upload | Download, SdoDone, bool]:
 
 
 def _pdo_id(communication: int) -> Steps:
-    """The id under which a PDO is sent, 0 if the node does not say."""
+    """The id under which a PDO is sent, 0 if the node does not say, or says one that no PDO can have."""
     cob_id = yield from _number(Upload(communication, 1))
-    return cob_id & 0x7FF
+    return cob_id & 0x7FF if 0x180 < cob_id & 0x7FF < 0x580 else 0
 
 
 def _send_on_sync() -> Generator[Upload | Download, SdoDone, None]:

@@ -26,7 +26,6 @@ from drivers.readings import (
     SourceCounters,
 )
 from drivers.usboard_messages import (
-    CONNECT_ANSWER,
     LEGACY_RESOLUTION_M,
     MESSAGE_SIZE,
     PARAMETER_PARTS,
@@ -36,6 +35,7 @@ from drivers.usboard_messages import (
     GroupValues,
     SendMode,
     UsBoardParameters,
+    check_message,
     decode_analog,
     decode_group,
     decode_parameters,
@@ -275,22 +275,16 @@ class _Board:
             return self._readings(decode_group(message), stamp_ns)
         if command in (Command.GET_DATA_1TO8, Command.GET_DATA_9TO16):
             return self._readings(decode_part(message), stamp_ns)
+        check_message(message)
         if command == Command.READ_PARASET:
             self._take_parameters(message)
         elif command == Command.GET_ANALOGIN:
             self.analog_v = decode_analog(message)
-        elif command == Command.CONNECT:
-            if message != CONNECT_ANSWER:
-                raise FrameError("bad_connect", message.hex())
-        elif command not in (Command.WRITE_PARASET, Command.WRITE_PARASET_TO_EEPROM):  # a setting tool on the same bus
-            raise FrameError("unknown_command", message.hex())
         return []
 
     def _take_parameters(self, message: bytes) -> None:
         now = self._now
         part = message[1]
-        if part >= PARAMETER_PARTS:
-            raise FrameError("bad_parameters", message.hex())
         now.parts[part] = message[2:]
         if len(now.parts) < PARAMETER_PARTS:
             return
@@ -587,8 +581,17 @@ class UsBoardSerialConversation(_UsBoardLink):
             if len(buffer) < SERIAL_SIZE:
                 return None
             frame = bytes(buffer[:SERIAL_SIZE])
-            if encode_serial_frame(frame[1:-2]) == frame:
-                del buffer[:SERIAL_SIZE]
-                return frame[1:-2]
-            self._board.counters.drop("bad_crc")
-            del buffer[0]  # look again from byte 1
+            try:
+                return self._whole_message(frame)
+            except FrameError as error:
+                self._board.counters.drop(error.reason)
+                del buffer[0]  # look again from byte 1
+
+    def _whole_message(self, frame: bytes) -> bytes:
+        """Checks CRC and content before any byte is given up: noise can have a right CRC, and a true frame in it."""
+        message = frame[1:-2]
+        if encode_serial_frame(message) != frame:
+            raise FrameError("bad_crc", frame.hex())
+        check_message(message)
+        del self._buffer[:SERIAL_SIZE]
+        return message

@@ -113,6 +113,25 @@ def decode_analog(message: bytes) -> tuple[float, ...]:
     return tuple(value * 5.0 / 4095.0 for value in _twelve_bits(message[:1] + message))
 
 
+def check_message(message: bytes) -> None:
+    """Raises FrameError if these 8 bytes are nothing that a board says: its name of the reason is the counter's."""
+    command = message[0]
+    if command == Command.GET_DATA:
+        decode_group(message)
+    elif command in (Command.GET_DATA_1TO8, Command.GET_DATA_9TO16):
+        decode_part(message)
+    elif command == Command.GET_ANALOGIN:
+        decode_analog(message)
+    elif command == Command.CONNECT:
+        if message != CONNECT_ANSWER:
+            raise FrameError("bad_connect", message.hex())
+    elif command == Command.READ_PARASET:
+        if message[1] >= PARAMETER_PARTS:
+            raise FrameError("bad_parameters", message.hex())
+    elif command not in (Command.WRITE_PARASET, Command.WRITE_PARASET_TO_EEPROM):  # answers to a setting tool
+        raise FrameError("unknown_command", message.hex())
+
+
 def _twelve_bits(message: bytes) -> tuple[int, ...]:
     """Four 12-bit values: low bytes at 2..5, high nibbles at 6 and 7."""
     n01, n23 = message[6], message[7]
