@@ -31,7 +31,7 @@ from service.config import (
     UsBoardSerialSonars,
     UsBoardSonars,
 )
-from service.fusion import Fusion, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer
+from service.fusion import SECTOR_MEMORY_NS, Fusion, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer
 from service.sensors import Chain, Laser, Sensor, Transducer, Wheels
 
 if TYPE_CHECKING:
@@ -225,9 +225,8 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
 
 
 def _sector_maps(config: Config) -> Iterator[SectorLayer]:
-    from mapping.sectors.rectangular import RectSectors
-
     from mapping.sectors.polar import PolarSectors
+    from mapping.sectors.rectangular import RectSectors
     from service.layers import PolarLayer, RectLayer
 
     footprint = np.array(config.robot.footprint_m)
@@ -241,6 +240,7 @@ def _sector_maps(config: Config) -> Iterator[SectorLayer]:
                 stop_rad=math.radians(polar.stop_deg),
                 sector_rad=math.radians(polar.sector_deg),
                 base_from_sensor=pose_of(polar.pose),
+                stale_after_ns=SECTOR_MEMORY_NS,
                 footprint=footprint,
                 range_max_m=math.inf if polar.range_max_m is None else polar.range_max_m,
             ),
@@ -255,6 +255,7 @@ def _sector_maps(config: Config) -> Iterator[SectorLayer]:
                 size_m=rect.size_m,
                 sector_m=rect.sector_m,
                 base_from_sensor=pose_of(rect.pose),
+                stale_after_ns=SECTOR_MEMORY_NS,
                 footprint=footprint,
             ),
             fed_by,

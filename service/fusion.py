@@ -40,12 +40,16 @@ F64 = NDArray[np.float64]
 
 SECOND = 1_000_000_000
 TICK_PERIOD_NS = 25_000_000  # how often tick() is to be called
+_FOREVER_NS = 1 << 62
 _AHEAD_LIMIT_NS = SECOND  # stamps farther in the future are nonsense
 _BEAMS_MAX = 100_000
-_SECTOR_PERIOD_NS = 100_000_000  # a sector map is published so often even if nothing feeds it
+_SECTOR_PERIOD_NS = 50_000_000  # a sector map is published so often even if nothing feeds it
+_SECTOR_GAP_NS = 20_000_000  # sonars that follow each other faster are published together, with the next tick
 _POSE_PERIOD_NS = 25_000_000
 _TOO_FAST_IN_A_ROW = 5  # then the counts are believed, and what lay between them is unknown
 _STALE_LIMIT_NS = 500_000_000
+SECTOR_MEMORY_NS = _STALE_LIMIT_NS - _SECTOR_PERIOD_NS
+"""How long a direction stays fresh without new evidence: what is stale is then published within half a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +73,7 @@ class Round:
 
 
 class SectorLayer(Protocol):
-    """One sector map, polar or rectangular, as fusion sees it."""
+    """One sector map, polar or rectangular, as fusion sees it. It lets evidence go stale after SECTOR_MEMORY_NS."""
 
     @property
     def sources(self) -> frozenset[str]:
@@ -172,7 +176,7 @@ class Fusion:
         self._pose_told_ns: int | None = None
         self._fresh_until_ns: dict[str, int] = {}
         self._sectors_told_ns: dict[int, int] = {}
-        self._sector_states: dict[int, bytes] = {}
+        self._sectors_untold: set[int] = set()  # changed since they were published
         self._newest_stamp_ns = 0
         self._late_since_ns: int | None = None
 
@@ -201,13 +205,12 @@ class Fusion:
         """To be called every TICK_PERIOD_NS: ages sectors, ends waiting, publishes grids that are due."""
         for source in [name for name, until_ns in self._fresh_until_ns.items() if now_ns > until_ns]:
             self._lose(source)
-        outputs: list[Output] = []
-        for index, layer in enumerate(self._parts.sectors):
-            output = layer.output(now_ns)
-            overdue = now_ns - self._sectors_told_ns.get(index, -_SECTOR_PERIOD_NS) >= _SECTOR_PERIOD_NS
-            if overdue or self._sector_states.get(index) != output.snapshot.state.tobytes():
-                outputs.append(self._told(index, output, now_ns))
-        self._draw_what_is_covered(now_ns)
+        outputs: list[Output] = [
+            self._tell(index, now_ns)
+            for index in range(len(self._parts.sectors))
+            if index in self._sectors_untold or self._told_since_ns(index, now_ns) >= _SECTOR_PERIOD_NS
+        ]
+        self.settle(now_ns)
         map_from_base = self._map_from_base_now()
         for grid in self._parts.grids:
             outputs.extend(grid.outputs(map_from_base, self._newest_stamp_ns, now_ns))
@@ -239,18 +242,14 @@ class Fusion:
         if event.state is LinkState.STARTING and source in self._chains:
             self._chains[source].forget()
         self._lose(source)
-        return [
-            self._told(index, layer.output(now_ns), now_ns)
-            for index, layer in enumerate(self._parts.sectors)
-            if source in layer.sources
-        ]
+        return [self._tell(index, now_ns) for index in self._fed_by(source)]
 
     def _lose(self, source: str) -> None:
         """Nothing of what it said is fresh any more."""
         self._fresh_until_ns.pop(source, None)
-        for layer in self._parts.sectors:
-            if source in layer.sources:
-                layer.lose(source)
+        for index in self._fed_by(source):
+            self._parts.sectors[index].lose(source)
+            self._sectors_untold.add(index)
 
     # --- lasers
 
@@ -261,14 +260,13 @@ class Fusion:
         outputs: list[Output] = [ScanOut(laser.name, scan, laser.base_from_sensor, laser.height_m)]
         sweep_ns = _last_beam_ns(scan) - scan.stamp_ns
         self._fresh_until_ns[laser.name] = scan.stamp_ns + stale_after_ns(reading.scan_period_ns, sweep_ns)
-        fed = [(index, layer) for index, layer in enumerate(self._parts.sectors) if laser.name in layer.sources]
-        if fed:
+        if fed := self._fed_by(laser.name):
             seen, base_from_sensor = self._as_seen_now(scan, laser.base_from_sensor)
-            for index, layer in fed:
-                layer.take_scan(laser.name, seen, base_from_sensor)
-                outputs.append(self._told(index, layer.output(now_ns), now_ns))
+            for index in fed:
+                self._parts.sectors[index].take_scan(laser.name, seen, base_from_sensor)
+                outputs.append(self._tell(index, now_ns))
         self._newest_stamp_ns = max(self._newest_stamp_ns, scan.stamp_ns)
-        self._draw_when_covered(laser.name, scan, scan.stamp_ns, _last_beam_ns(scan), now_ns)
+        self._wait_for_poses(laser.name, scan, scan.stamp_ns, _last_beam_ns(scan), now_ns)
         return outputs
 
     def _checked_scan(self, laser: Laser, reading: ScanReading) -> Scan | None:
@@ -317,12 +315,14 @@ class Fusion:
         heard = Round(reading.stamp_ns, cones, chain.cone_rad, chain.range_min_m, chain.range_max_m)
         self._fresh_until_ns[chain.name] = reading.stamp_ns + memory.stale_after_ns
         outputs: list[Output] = [memory.output(reading.stamp_ns)]
-        for index, layer in enumerate(self._parts.sectors):
-            if chain.name in layer.sources:
-                layer.take_round(chain.name, heard)
-                outputs.append(self._told(index, layer.output(now_ns), now_ns))
+        for index in self._fed_by(chain.name):
+            self._parts.sectors[index].take_round(chain.name, heard)
+            if self._told_since_ns(index, now_ns) >= _SECTOR_GAP_NS:
+                outputs.append(self._tell(index, now_ns))
+            else:
+                self._sectors_untold.add(index)
         self._newest_stamp_ns = max(self._newest_stamp_ns, reading.stamp_ns)
-        self._draw_when_covered(chain.name, heard, reading.stamp_ns, reading.stamp_ns, now_ns)
+        self._wait_for_poses(chain.name, heard, reading.stamp_ns, reading.stamp_ns, now_ns)
         return outputs
 
     # --- wheels
@@ -350,7 +350,6 @@ class Fusion:
         if self._pose_told_ns is None or state.stamp_ns - self._pose_told_ns >= _POSE_PERIOD_NS:
             self._pose_told_ns = state.stamp_ns
             outputs.append(self._pose_of(state))
-        self._draw_what_is_covered(now_ns)
         return outputs
 
     def _is_too_fast(self, reading: WheelReading) -> bool:
@@ -382,22 +381,19 @@ class Fusion:
 
     # --- grids
 
-    def _draw_when_covered(self, source: str, value: Scan | Round, first_ns: int, last_ns: int, now_ns: int) -> None:
-        if not any(source in grid.sources for grid in self._parts.grids):
-            return
-        if self._odometry is None:
-            self._draw_standing(source, value)
-            return
-        for lost, reason in self._waiting.put(source, value, first_ns, last_ns, now_ns):
-            self._drop(lost, reason)
-        self._draw_what_is_covered(now_ns)
+    def settle(self, now_ns: int) -> None:
+        """Draw into the grids what poses cover by now, in order of stamps; to be called after on_item.
 
-    def _draw_what_is_covered(self, now_ns: int) -> None:
+        Apart from it so that sector maps leave before the slower grids are worked on.
+        """
         if not len(self._waiting):
             return
-        released = self._waiting.release(
-            oldest_ns=self._poses.oldest_ns, newest_ns=self._poses.newest_ns, now_ns=now_ns
-        )
+        if self._odometry is None:
+            released = self._waiting.release(oldest_ns=-_FOREVER_NS, newest_ns=_FOREVER_NS, now_ns=now_ns)
+        else:
+            released = self._waiting.release(
+                oldest_ns=self._poses.oldest_ns, newest_ns=self._poses.newest_ns, now_ns=now_ns
+            )
         for source, reason in released.dropped:
             self._drop(source, reason)
             if reason == "odometry_late":
@@ -405,9 +401,20 @@ class Fusion:
         for source, value in released.ready:
             self._late_since_ns = None
             try:
-                self._draw_moving(source, value)
+                self._draw(source, value)
             except GoneError:
                 self._drop(source, "odometry_broken")
+
+    def _wait_for_poses(self, source: str, value: Scan | Round, first_ns: int, last_ns: int, now_ns: int) -> None:
+        if any(source in grid.sources for grid in self._parts.grids):
+            for lost, reason in self._waiting.put(source, value, first_ns, last_ns, now_ns):
+                self._drop(lost, reason)
+
+    def _draw(self, source: str, value: Scan | Round) -> None:
+        if self._odometry is None:
+            self._draw_standing(source, value)
+        else:
+            self._draw_moving(source, value)
 
     def _draw_moving(self, source: str, value: Scan | Round) -> None:
         """Raises GoneError if the track is broken under the sweep."""
@@ -465,10 +472,17 @@ class Fusion:
             return True
         return False
 
-    def _told(self, index: int, output: PolarOut | RectOut, now_ns: int) -> PolarOut | RectOut:
+    def _fed_by(self, source: str) -> list[int]:
+        return [index for index, layer in enumerate(self._parts.sectors) if source in layer.sources]
+
+    def _told_since_ns(self, index: int, now_ns: int) -> int:
+        told_ns = self._sectors_told_ns.get(index)
+        return _SECTOR_PERIOD_NS if told_ns is None else now_ns - told_ns
+
+    def _tell(self, index: int, now_ns: int) -> PolarOut | RectOut:
         self._sectors_told_ns[index] = now_ns
-        self._sector_states[index] = output.snapshot.state.tobytes()
-        return output
+        self._sectors_untold.discard(index)
+        return self._parts.sectors[index].output(now_ns)
 
     def _drop(self, source: str, reason: str, count: int = 1) -> list[Output]:
         reasons = self.drops.setdefault(source, {})

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 from drivers.queues import BoundedQueue
@@ -123,9 +124,11 @@ class Worker:
             if isinstance(item, DeviceEvent):
                 self._next_health_ns = min(self._next_health_ns, self._health_told_ns + _HEALTH_GAP_NS)
         now_ns = self._now_ns()
+        if items:
+            self._guard("settle", partial(self._settle, now_ns))
         if now_ns >= self._next_tick_ns:
             self._next_tick_ns = now_ns + TICK_PERIOD_NS
-            self._guard("tick", lambda: self._fusion.tick(now_ns))
+            self._guard("tick", partial(self._fusion.tick, now_ns))
         if now_ns >= self._next_health_ns:
             self._tell_health(now_ns)
         self._beat(now_ns)
@@ -148,6 +151,10 @@ class Worker:
             self.errors += 1
             if self.errors <= 20 or self.errors % 1000 == 0:
                 log.exception("%s: internal error in fusion (%s); the reading is lost", source, error)
+
+    def _settle(self, now_ns: int) -> list[Output]:
+        self._fusion.settle(now_ns)
+        return []
 
     def _tell_health(self, now_ns: int) -> None:
         self._health_told_ns = now_ns

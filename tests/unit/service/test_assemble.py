@@ -142,6 +142,7 @@ def test_the_whole_robot_draws_and_tells(config: Config) -> None:
             told = fusion.on_item(laser, scan, now + 30 * ms)
         for name, channel in (("sonars-front", 3), ("side", 1)):
             fusion.on_item(name, ChainReading(now + 1, (RangeReading(channel, 1.0, RangeStatus.ECHO),)), now + 2)
+        fusion.settle(now + 30 * ms)
     assert fusion.drops == {}
     polar = next(each for each in told if isinstance(each, PolarOut))
     ahead = int(np.searchsorted(polar.snapshot.edges_rad, 0.01)) - 1

@@ -15,6 +15,7 @@ from drivers.readings import (
     LinkState,
     RangeReading,
     RangeStatus,
+    Reading,
     ScanReading,
     WheelReading,
 )
@@ -101,11 +102,20 @@ class GridDiary:
         return []
 
 
+class Driven(Fusion):
+    """Fusion that settles after every item, as its thread does."""
+
+    def on_item(self, source: str, item: Reading | DeviceEvent, now_ns: int) -> list[Output]:
+        outputs = super().on_item(source, item, now_ns)
+        self.settle(now_ns)
+        return outputs
+
+
 @dataclass
 class Bench:
     """Fusion between a driver's hand and two diaries."""
 
-    fusion: Fusion
+    fusion: Driven
     sectors: SectorDiary
     grid: GridDiary
 
@@ -120,7 +130,7 @@ def bench(*, drive: bool = True, wait_ms: int = 500) -> Bench:
         drive=("drive", GEOMETRY) if drive else None,
         wait_ns=wait_ms * MS,
     )
-    return Bench(Fusion(parts), sectors, grid)
+    return Bench(Driven(parts), sectors, grid)
 
 
 def scan(stamp_ns: int, *, beams: int = 5, beam_period_ns: float = 0.0, range_m: float = 2.0) -> ScanReading:
@@ -435,6 +445,14 @@ def test_sectors_are_published_at_least_ten_times_a_second() -> None:
     b = bench()
     told = [n for n in range(40) if any(isinstance(o, PolarOut) for o in b.fusion.tick(n * 25 * MS))]
     assert 10 <= len(told) <= 20
+
+
+def test_sonars_that_follow_each_other_closely_are_published_together() -> None:
+    b = bench()
+    assert any(isinstance(each, PolarOut) for each in b.fusion.on_item("ring", ring(0, 1.0), 10 * MS))
+    assert not any(isinstance(each, PolarOut) for each in b.fusion.on_item("ring", ring(MS, 2.0), 15 * MS))
+    assert any(isinstance(each, PolarOut) for each in b.fusion.tick(26 * MS))
+    assert len(b.sectors.rounds) == 2
 
 
 def test_readings_from_nowhere_are_counted() -> None:
