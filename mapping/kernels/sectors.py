@@ -375,3 +375,189 @@ def nearest_in_cells(x: Any, y: Any, x0: float, y0: float, edge: float, rows: in
                 best[row, col] = distance
                 at_x[row, col], at_y[row, col] = x[k], y[k]
     return best, at_x, at_y
+
+
+@njit(cache=True, nogil=True)
+def artos_update(
+    counters: Any, touched: Any, row0: int, col0: int, resolution: float,
+    origin_x: float, origin_y: float, yaw: float, start: float, width: float, span: float,
+    blocked: Any, obstacle: Any, at: Any, reach: Any, area: Any, limit: int, step: int,
+) -> None:  # fmt: skip
+    """One step of the two-step update for one polar sector map; see mapping.sectors.artos.
+
+    blocked: (R, C) cells hit in this update.  obstacle, at: (N,) distance and bearing of obstacles, NaN none.
+    reach: (N,) up to which a sector frees, 0 nothing.  area: first row, end row, first and end column, in the window.
+    step: 1 counts up the cells of obstacles, 2 counts down the cells nearer than reach.
+    """
+    rows, cols = counters.shape
+    count = len(reach)
+    if step == 1:
+        for sector in range(count):
+            if math.isnan(obstacle[sector]):
+                continue
+            x = origin_x + obstacle[sector] * math.cos(yaw + at[sector])
+            y = origin_y + obstacle[sector] * math.sin(yaw + at[sector])
+            row, col = math.floor(y / resolution) - row0, math.floor(x / resolution) - col0
+            if 0 <= row < rows and 0 <= col < cols:
+                counters[row, col] = min(counters[row, col] + 1, limit)
+                touched[row, col] = True
+                blocked[row, col] = True
+        return
+    farthest = 0.0
+    for sector in range(count):
+        farthest = max(farthest, reach[sector])
+    farthest_square = farthest * farthest
+    for row in range(area[0], area[1]):
+        y = (row + row0 + 0.5) * resolution - origin_y
+        for col in range(area[2], area[3]):
+            x = (col + col0 + 0.5) * resolution - origin_x
+            square = x * x + y * y
+            if square >= farthest_square or blocked[row, col]:
+                continue
+            sector = sector_of(math.atan2(y, x) - yaw, start, width, span, count)
+            if sector >= 0 and square < reach[sector] * reach[sector]:
+                counters[row, col] = max(counters[row, col] - 1, -limit)
+                touched[row, col] = True
+
+
+@njit(cache=True, nogil=True)
+def arc_cells(
+    origin_x: float, origin_y: float, radius: float, lo: float, hi: float, resolution: float, out: Any
+) -> int:
+    """The cells an arc passes, in order: it is cut wherever it crosses a line of the grid. Returns how many.
+
+    out: (M, 2) int64 with room for 8 * radius / resolution + 20 cells.
+    """
+    left, right = origin_x - radius, origin_x + radius
+    low, high = origin_y - radius, origin_y + radius
+    cols = math.floor(right / resolution) - math.floor(left / resolution)
+    rows = math.floor(high / resolution) - math.floor(low / resolution)
+    cuts = np.empty(2 * (rows + cols) + 2)
+    cuts[0], cuts[1] = lo, hi
+    count = 2
+    for k in range(cols):
+        across = ((math.floor(left / resolution) + 1 + k) * resolution - origin_x) / radius
+        half = math.acos(min(max(across, -1.0), 1.0))
+        for angle in (half, -half):
+            along = lo + (angle - lo) % TWO_PI
+            if along < hi:
+                cuts[count] = along
+                count += 1
+    for k in range(rows):
+        across = ((math.floor(low / resolution) + 1 + k) * resolution - origin_y) / radius
+        half = math.asin(min(max(across, -1.0), 1.0))
+        for angle in (half, math.pi - half):
+            along = lo + (angle - lo) % TWO_PI
+            if along < hi:
+                cuts[count] = along
+                count += 1
+    order = np.sort(cuts[:count])
+    found = 0
+    for k in range(count - 1):
+        middle = 0.5 * (order[k] + order[k + 1])
+        row = math.floor((origin_y + radius * math.sin(middle)) / resolution)
+        col = math.floor((origin_x + radius * math.cos(middle)) / resolution)
+        if found == 0 or out[found - 1, 0] != row or out[found - 1, 1] != col:
+            out[found, 0], out[found, 1] = row, col
+            found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def cone_cells(
+    origin_x: float, origin_y: float, yaw: float, start: float, width: float, span: float, reach: Any,
+    resolution: float, row0: int, col0: int, free: Any,
+) -> None:  # fmt: skip
+    """Mark the cells whose middle lies in a sector, nearer than its reach. free: (R, C) bool, from (row0, col0)."""
+    rows, cols = free.shape
+    for row in range(rows):
+        y = (row + row0 + 0.5) * resolution - origin_y
+        for col in range(cols):
+            x = (col + col0 + 0.5) * resolution - origin_x
+            sector = sector_of(math.atan2(y, x) - yaw, start, width, span, len(reach))
+            if sector >= 0 and math.hypot(x, y) < reach[sector]:
+                free[row, col] = True
+
+
+@njit(cache=True, nogil=True)
+def nearest_cells_in_sectors(
+    kinds: Any, row0: int, col0: int, resolution: float, origin_x: float, origin_y: float, yaw: float, edges: Any,
+    width: float, range_max: float, body: Any, body_reach: float,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """Per sector the nearest occupied cell and the nearest unknown one, by their edges within the sector.
+
+    kinds: (R, C) int8, 0 free, 1 occupied, 2 unknown; what lies outside is unknown.  edges: of sectors, sensor frame.
+    body: (V, 2) the vehicle's outline, sensor frame: what is unknown within it does not count.
+    Returns (N,) distance to occupied, inf none, its bearing, distance to unknown.
+    """
+    rows, cols = kinds.shape
+    count = len(edges) - 1
+    start, span = edges[0], edges[-1] - edges[0]
+    edge_x, edge_y = np.cos(edges), np.sin(edges)
+    occupied = np.full(count, math.inf)
+    at = np.full(count, math.nan)
+    unknown = np.full(count, range_max)
+    c, s = math.cos(yaw), math.sin(yaw)
+    corner = np.empty((4, 2))
+    nothing = np.empty((0, 2))
+    for index in range(rows * cols + 1):
+        outside = index == rows * cols  # last, the patch itself: beyond its border nothing is known
+        if outside:
+            kind, row, col, tall, wide = 2, 0, 0, rows, cols
+        else:
+            row, col, tall, wide = index // cols, index % cols, 1, 1
+            kind = int(kinds[row, col])
+            if kind == 0:
+                continue
+        x_lo, y_lo = (col + col0) * resolution - origin_x, (row + row0) * resolution - origin_y
+        x_hi, y_hi = x_lo + wide * resolution, y_lo + tall * resolution
+        within = x_lo <= 0.0 <= x_hi and y_lo <= 0.0 <= y_hi
+        if not outside:
+            near = math.hypot(max(x_lo, -x_hi, 0.0), max(y_lo, -y_hi, 0.0))
+            if near >= range_max:
+                continue
+        if within != outside:  # the origin stands on the cell, or off the patch
+            if kind == 1:
+                occupied[:] = 0.0
+                at[:] = 0.5 * (edges[1:] + edges[:-1])
+            elif body_reach == 0.0 or outside:
+                unknown[:] = 0.0
+            if outside:
+                continue
+        for k in range(4):
+            x, y = (x_hi if k == 1 or k == 2 else x_lo), (y_hi if k >= 2 else y_lo)
+            corner[k, 0], corner[k, 1] = c * x + s * y, c * y - s * x
+        for k in range(4):
+            ax, ay = corner[k - 1, 0], corner[k - 1, 1]
+            bx, by = corner[k, 0], corner[k, 1]
+            ex, ey = bx - ax, by - ay
+            a_rad, b_rad = math.atan2(ay, ax), math.atan2(by, bx)
+            turn = (b_rad - a_rad + math.pi) % TWO_PI - math.pi
+            along = ((a_rad if turn >= 0.0 else b_rad) - EDGE_RAD - start) % TWO_PI
+            sweep = abs(turn) + 2.0 * EDGE_RAD
+            px, py = nearest_on(ax, ay, bx, by)
+            if math.hypot(px, py) < 1e-9:
+                along, sweep = 0.0, TWO_PI
+            for lap in range(2):
+                first = along - lap * TWO_PI
+                last = first + sweep
+                if last < 0.0 or first > span:
+                    continue
+                for sector in range(max(0, math.floor(first / width)), min(count - 1, math.floor(last / width)) + 1):
+                    t0, t1 = clip_to_wedge(
+                        ax, ay, bx, by, edge_x[sector], edge_y[sector], edge_x[sector + 1], edge_y[sector + 1]
+                    )
+                    if (t1 - t0) * (abs(ex) + abs(ey)) < TOUCH_M:
+                        continue
+                    ux, uy = ax + t0 * ex, ay + t0 * ey
+                    vx, vy = ax + t1 * ex, ay + t1 * ey
+                    if kind == 1:
+                        px, py = nearest_on(ux, uy, vx, vy)
+                        distance = math.hypot(px, py)
+                        if distance < occupied[sector]:
+                            occupied[sector] = distance
+                            at[sector] = math.atan2(py, px)
+                    else:
+                        polygon = body if body_reach > 0.0 else nothing
+                        unknown[sector] = min(unknown[sector], nearest_outside(ux, uy, vx, vy, polygon, body_reach))
+    return occupied, at, unknown

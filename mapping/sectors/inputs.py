@@ -19,13 +19,17 @@ class SpacingMemory:
 
     def __init__(self) -> None:
         self._finest: dict[str, float] = {}
+        self._last: dict[str, F64] = {}
 
     def of(self, source: str, bearing_rad: F64, spacing_rad: float | None) -> float:
         """The spacing to judge gaps by; spacing_rad is the device's own figure, if it is known."""
         if spacing_rad is not None:
             return spacing_rad
-        median = median_spacing(bearing_rad)
         known = self._finest.get(source)
+        if known is not None and np.array_equal(self._last[source], bearing_rad):
+            return known  # the usual case: the same directions as the last time
+        median = median_spacing(bearing_rad)
+        self._last[source] = bearing_rad.copy()
         if median is not None and median > 0.0 and (known is None or median < known):
             known = self._finest[source] = median
         return known if known is not None else 0.0
@@ -33,6 +37,7 @@ class SpacingMemory:
     def forget(self, source: str) -> None:
         """The device is gone; what answers next may be set differently."""
         self._finest.pop(source, None)
+        self._last.pop(source, None)
 
 
 def checked_beams(bearing_rad: ArrayLike, range_m: ArrayLike) -> tuple[F64, F64]:

@@ -109,7 +109,7 @@ def sight_of_beams(
     hi = bearing_rad[0] + along + reach
     looked = (length >= 0.0) | np.isneginf(length)
     length[np.isposinf(length)] = range_max_m
-    sees = looked & (length > 0.0) & (length <= range_max_m)
+    sees = looked & (length > 0.0) & (length <= range_max_m) & np.isfinite(length)
     return Sight(virtual_from_sensor, lo[sees], hi[sees], length[sees], lo[looked], hi[looked])
 
 
@@ -130,7 +130,7 @@ def sight_of_cone(*, cone_rad: float, free_m: float, near_m: float, virtual_from
         hi = np.concatenate((-side[-2::-1], hi, side[1:]))
         near = np.full(len(side) - 1, near_m)
         length = np.concatenate((near, np.maximum(length, near_m), near))
-    sees = length > 0.0
+    sees = (length > 0.0) & np.isfinite(length)
     return Sight(virtual_from_transducer, lo[sees], hi[sees], length[sees], np.array([-half]), np.array([half]))
 
 

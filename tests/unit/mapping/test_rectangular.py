@@ -1,0 +1,160 @@
+"""Rectangular sector maps: nearest obstacle by square, and which squares were seen whole (S36)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapping.frames import IDENTITY, Pose2
+from mapping.sectors.rectangular import RectSectors
+from mapping.sectors.snapshot import RectSnapshot, SectorState
+
+F64 = NDArray[np.float64]
+OBSTACLE, FREE, UNKNOWN, STALE = SectorState.OBSTACLE, SectorState.FREE, SectorState.UNKNOWN, SectorState.STALE
+BEARING = np.deg2rad(np.arange(720) * 0.5)
+BODY = [[0.45, 0.30], [-0.45, 0.30], [-0.45, -0.30], [0.45, -0.30]]
+
+
+def sweep(sectors: RectSectors, range_m: F64, *, mount: Pose2 = IDENTITY, stamp_ns: int = 0) -> None:
+    sectors.update_beams(
+        "laser",
+        base_from_sensor=mount,
+        bearing_rad=BEARING[: len(range_m)],
+        range_m=range_m,
+        range_min_m=0.05,
+        range_max_m=30.0,
+        stamp_ns=stamp_ns,
+    )
+
+
+def cell(snapshot: RectSnapshot, x: float, y: float) -> tuple[int, int]:
+    return (
+        int(np.searchsorted(snapshot.y_edges_m, y, side="right")) - 1,
+        int(np.searchsorted(snapshot.x_edges_m, x, side="right")) - 1,
+    )
+
+
+def test_raster_is_centred_and_ascending() -> None:
+    snapshot = RectSectors(sources=("laser",), size_m=(4.0, 2.1), sector_m=0.25).snapshot(0)
+    assert snapshot.state.shape == (9, 16)
+    assert snapshot.x_edges_m[0] == -2.0
+    assert snapshot.x_edges_m[-1] == 2.0
+    assert snapshot.y_edges_m[0] == -1.125
+    assert (snapshot.state == UNKNOWN).all()
+
+
+def test_no_return_frees_every_square() -> None:
+    sectors = RectSectors(sources=("laser",))
+    sweep(sectors, np.full(720, np.inf))
+    assert (sectors.snapshot(0).state == FREE).all()
+
+
+def test_a_wall_is_met_and_what_is_behind_it_unknown() -> None:
+    sectors = RectSectors(sources=("laser",))
+    with np.errstate(divide="ignore"):
+        ranges = np.where(np.cos(BEARING) > 0.05, 1.1 / np.cos(BEARING), np.inf)
+    sweep(sectors, ranges)
+    snapshot = sectors.snapshot(0)
+    row, col = cell(snapshot, 1.1, 0.1)
+    assert (snapshot.state[:, col] == OBSTACLE).all()
+    np.testing.assert_allclose(snapshot.x_m[:, col], 1.1)
+    assert (np.abs(snapshot.y_m[row, col]) <= 0.25).all()
+    assert (snapshot.state[:, col + 1 :] == UNKNOWN).all()
+    assert (snapshot.state[:, :col] == FREE).all()
+
+
+def test_the_nearest_point_of_a_square_is_kept() -> None:
+    sectors = RectSectors(sources=("laser",), sector_m=1.0)
+    ranges = np.full(720, np.nan)
+    ranges[:20] = np.linspace(1.9, 1.2, 20)
+    sweep(sectors, ranges)
+    snapshot = sectors.snapshot(0)
+    row, col = cell(snapshot, 1.2, 0.2)
+    assert math.hypot(snapshot.x_m[row, col], snapshot.y_m[row, col]) == pytest.approx(1.2)
+
+
+def test_one_invalid_beam_spoils_the_squares_it_crosses_only() -> None:
+    sectors = RectSectors(sources=("laser",))
+    ranges = np.full(720, np.inf)
+    ranges[30] = np.nan  # 15 degrees
+    sweep(sectors, ranges)
+    snapshot = sectors.snapshot(0)
+    along = np.linspace(0.01, 2.0, 200)
+    crossed = {cell(snapshot, r * math.cos(math.radians(15.0)), r * math.sin(math.radians(15.0))) for r in along}
+    for row, col in crossed:
+        assert snapshot.state[row, col] == UNKNOWN
+    assert (snapshot.state[:, :7] == FREE).all()
+    assert (snapshot.state == UNKNOWN).sum() <= len(crossed) + 6
+
+
+def test_the_vehicle_needs_no_looking_at() -> None:
+    sectors = RectSectors(sources=("laser",), footprint=BODY)
+    # a laser on the right front corner that cannot see through the vehicle: 270 degrees
+    ranges = np.full(720, np.inf)
+    ranges[(math.radians(100.0) < BEARING) & (math.radians(170.0) > BEARING)] = np.nan
+    sweep(sectors, ranges, mount=Pose2(0.44, -0.29, 0.0))
+    snapshot = sectors.snapshot(0)
+    assert snapshot.state[cell(snapshot, 0.0, 0.0)] == UNKNOWN  # under it
+    assert snapshot.state[cell(snapshot, 0.5, -0.5)] == FREE
+    assert snapshot.state[cell(snapshot, 1.0, 1.0)] == FREE
+    assert snapshot.state[cell(snapshot, -1.0, 0.7)] == UNKNOWN  # behind it
+    assert snapshot.state[cell(snapshot, 0.45, -0.20)] == FREE  # half under it
+
+
+def test_an_echo_is_an_obstacle_in_every_square_of_its_arc() -> None:
+    sectors = RectSectors(sources=("sonar",))
+    sectors.update_cone(
+        "sonar",
+        0,
+        base_from_transducer=Pose2(0.0, 0.0, math.pi / 2.0),
+        cone_rad=math.radians(60.0),
+        range_m=1.6,
+        range_min_m=0.1,
+        range_max_m=3.0,
+        stamp_ns=0,
+    )
+    snapshot = sectors.snapshot(0)
+    angle = math.pi / 2.0 + np.linspace(-math.radians(29.9), math.radians(29.9), 500)
+    arc = {cell(snapshot, 1.6 * math.cos(a), 1.6 * math.sin(a)) for a in angle}
+    hit = set(zip(*(i.tolist() for i in np.nonzero(snapshot.state == OBSTACLE))))
+    assert arc <= hit
+    assert len(hit) <= len(arc) + 2
+    assert snapshot.state[cell(snapshot, 0.01, 0.6)] == FREE  # well before the echo, within the cone
+    assert snapshot.state[cell(snapshot, 0.01, 1.1)] == UNKNOWN  # nearer to the echo than half its distance
+    assert snapshot.state[cell(snapshot, 1.0, 0.1)] == UNKNOWN
+
+
+def test_lost_and_old_squares_are_stale() -> None:
+    sectors = RectSectors(sources=("laser",), stale_after_ns=100)
+    sweep(sectors, np.full(720, 1.0))
+    seen = sectors.snapshot(50).state.copy()
+    old = sectors.snapshot(101)
+    assert ((old.state == STALE) == (seen != UNKNOWN)).all()
+    sweep(sectors, np.full(720, 1.0), stamp_ns=102)
+    assert (sectors.snapshot(102).state == seen).all()
+    sectors.lost("laser")
+    assert not (sectors.snapshot(102).state == FREE).any()
+
+
+def test_an_obstacle_stays_where_the_next_scan_is_blind() -> None:
+    sectors = RectSectors(sources=("laser",))
+    ranges = np.full(720, np.inf)
+    ranges[30] = 1.0
+    sweep(sectors, ranges)
+    ranges[30] = np.nan
+    sweep(sectors, ranges, stamp_ns=1)
+    snapshot = sectors.snapshot(1)
+    at = cell(snapshot, math.cos(math.radians(15.0)), math.sin(math.radians(15.0)))
+    assert snapshot.state[at] == OBSTACLE
+    ranges[30] = np.inf
+    sweep(sectors, ranges, stamp_ns=2)
+    assert sectors.snapshot(2).state[at] == FREE
+
+
+@pytest.mark.parametrize(("size", "edge"), [((0.0, 1.0), 0.1), ((1.0, 1.0), 0.0), ((1e5, 1e5), 0.1)])
+def test_impossible_rasters_are_refused(size: tuple[float, float], edge: float) -> None:
+    with pytest.raises(ValueError):
+        RectSectors(sources=("laser",), size_m=size, sector_m=edge)
