@@ -229,6 +229,8 @@ def _world_stage(options: argparse.Namespace, config: Table, now_ns: int) -> Sta
     )
     if options.speed > 1.0 and plan.route is not None:
         config.setdefault("drive", {})["max_wheel_speed_m_s"] = 5.0 * options.speed
+        for wheels in config.get("wheels", {}).values():
+            wheels["max_turns_per_s"] = 20.0 * options.speed
     name = plan.name or Path(options.world).stem
     return Stage(name, scene, config, PROFILES[options.laser], commands=commands, lap_s=lap_s)
 
@@ -241,7 +243,7 @@ def _log_stage(options: argparse.Namespace, config: Table, now_ns: int) -> Stage
     track_width_m = float(config.get("drive", {}).get("track_width_m", 0.5))
     scene = LogScene(log, pace=pace, track_width_m=track_width_m, origin_ns=now_ns)
     config = for_log(
-        config, scene.mount, track_width_m=track_width_m, sample_ms=round(pace.sample_s * 1e3), wheel_m_s=10.0
+        config, scene.mount, track_width_m=track_width_m, rate_hz=round(1.0 / pace.sample_s, 3), wheel_m_s=10.0
     )
     stage = Stage(options.log.name.split(".")[0], scene, config, laser_profile(log, sweep_s=pace.sweep_s), exact=True)
     stage.notes.append(

@@ -265,11 +265,11 @@ def preset(name: str) -> Table:
 
 
 def for_log(
-    config: Mapping[str, Any], mount: Mount, *, track_width_m: float, sample_ms: int, wheel_m_s: float
+    config: Mapping[str, Any], mount: Mount, *, track_width_m: float, rate_hz: float, wheel_m_s: float
 ) -> Table:
     """A configuration in which only the laser and the wheels are left, as a recorded log knows them.
 
-    mount: the log's laser.  sample_ms, wheel_m_s: how often wheels are asked, and how fast they may turn.
+    mount: the log's laser.  rate_hz, wheel_m_s: how often wheels are asked, and how fast they may turn.
     """
     table = copy.deepcopy(dict(config))
     lasers = table.get("lasers", {})
@@ -289,7 +289,7 @@ def for_log(
     table.setdefault("drive", {})["track_width_m"] = track_width_m
     table["drive"]["max_wheel_speed_m_s"] = wheel_m_s
     for wheels in table["wheels"].values():
-        wheels["period_ms"] = sample_ms
+        wheels["rate_hz"] = rate_hz
     _keep_sources(table, f"lasers.{name}", name)
     return table
 
@@ -350,4 +350,4 @@ def _toml_value(key: str, value: Any) -> str:
 
 def _toml_text(text: str) -> str:
     escapes = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
-    return '"' + "".join(escapes.get(c, c if c.isprintable() else f"\\u{ord(c):04x}") for c in text) + '"'
+    return '"' + "".join(escapes.get(c, c if c.isprintable() else f"\\U{ord(c):08x}") for c in text) + '"'

@@ -364,11 +364,14 @@ class SimScene:
         self.origin_ns = origin_ns
         self.motion_ns: int | None = origin_ns if begin_at_origin else None
         self._wheels = Wheels(motion, track_width_m=track_width_m, errors=errors or WheelErrors())
+        self._newest_pose: tuple[int, F64] | None = None
+        self._newest_travel: tuple[int, tuple[float, float]] | None = None
 
     def begin_motion(self, now_ns: int) -> None:
         """Let the robot drive from now on; a second call changes nothing."""
         if self.motion_ns is None:
             self.motion_ns = now_ns
+            self._newest_pose = self._newest_travel = None
 
     def pose_at(self, stamp_ns: ArrayLike) -> F64:
         """True poses (N, 3) of the robot's base in the world at times (N,) in nanoseconds; yaw not wrapped."""
@@ -385,7 +388,7 @@ class SimScene:
 
     def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
         """See `device.Scene`."""
-        pose = self.pose_at([now_ns])
+        pose = self._pose_now(now_ns)
         x, y = _mounted(pose, mount)[0]
         here: Point = (float(x), float(y))
         heading = float(pose[0, 2]) + mount.yaw_rad
@@ -394,8 +397,16 @@ class SimScene:
 
     def wheel_travel_m(self, now_ns: int) -> tuple[float, float]:
         """See `device.Scene`."""
-        left, right = self._wheels.travel_at(self.motion_s(np.array([float(now_ns)])))[0]
-        return float(left), float(right)
+        if self._newest_travel is None or self._newest_travel[0] != now_ns:  # both encoders ask at the same SYNC
+            left, right = self._wheels.travel_at(self.motion_s(np.array([float(now_ns)])))[0]
+            self._newest_travel = (now_ns, (float(left), float(right)))
+        return self._newest_travel[1]
+
+    def _pose_now(self, now_ns: int) -> F64:
+        """(1, 3); transducers that fire together share it."""
+        if self._newest_pose is None or self._newest_pose[0] != now_ns:
+            self._newest_pose = (now_ns, self.pose_at([now_ns]))
+        return self._newest_pose[1]
 
     def motion_s(self, stamp_ns: F64) -> F64:
         """Time on the motion (N,) at moments (N,)."""

@@ -135,6 +135,7 @@ class World:
     circles: Circles
     walkers: list[Walker] = field(default_factory=list)
     _seen_at: dict[float, tuple[Segments, Circles]] = field(default_factory=dict)
+    _bodies: tuple[float, F64] | None = None
 
     @staticmethod
     def from_plan(plan: FloorPlan, seed: int = 0) -> World:
@@ -176,6 +177,7 @@ class World:
         """
         segments, circles = self._surfaces(z_m)
         here = np.asarray(origin, dtype=np.float64)
+        segments = segments.only(np.hypot(*_nearest_points(segments.a - here, segments.b - here).T) <= range_max_m)
         centers, radii = self._round_things(circles, stamp_s, z_m)
         points = np.concatenate(
             (
@@ -199,8 +201,10 @@ class World:
         """Centres and radii of circles and people that a sonar meets."""
         if not self.walkers or z_m > PERSON_HEIGHT_M:
             return circles.center, circles.radius_m
-        now = np.array([stamp_s])
-        bodies = np.concatenate([w.place(now)[0] for w in self.walkers])
+        if self._bodies is None or self._bodies[0] != stamp_s:
+            now = np.array([stamp_s])
+            self._bodies = (stamp_s, np.concatenate([w.place(now)[0] for w in self.walkers]))
+        bodies = self._bodies[1]
         radii = np.append(circles.radius_m, np.full(len(bodies), BODY_RADIUS_M))
         return np.concatenate((circles.center, bodies)), radii
 

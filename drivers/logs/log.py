@@ -25,6 +25,7 @@ SYNTHETIC_SPEED_M_S = 0.3
 SYNTHETIC_TURN_RAD_S = 0.5
 SYNTHETIC_SHORTEST_S = 0.1
 SMALLEST_ORDERED_SHARE = 0.8  # more rows out of order than the rest: the file is shuffled, the stamps are right
+SHORTEST_LIMIT_M = 3.9  # no laser's range ends sooner
 WORST_LEGIBLE_SHARE = 0.5  # fewer different stamps than this share of the scans: the stamps are useless
 
 
@@ -194,35 +195,41 @@ def no_echo_threshold(scans: Sequence[F64], declared_max_m: float | None = None)
     """The reading from which on a log means "no echo", or +inf if the log has no such reading.
 
     Lasers write one fixed number (or a few) for it, their largest: a needle in the histogram at the far end, seen
-    by many beams. A wall at the log's greatest distance is no needle: noise and slant spread it. So among the
-    1 cm bins within 3 % of the largest reading the lowest needle counts: 3 times what its neighbourhood of 10 cm
-    holds, and more than a fluke. Readings of 81.83 m and more are codes of SICK's LMS family (8183 and up, in cm),
-    few or many; a declared maximum range counts too.
+    by beams all over the field. A wall at the log's greatest distance is no such needle: noise and slant spread it, and
+    only a few beams meet it. So among the 1 cm bins within 3 % of the largest reading the lowest needle counts: 3 times
+    what its neighbourhood of 10 cm holds, more than a fluke, said by at least one beam in 30, not by all beams always,
+    and no shorter than any laser's limit. Readings of 81.83 m and more are codes of SICK's LMS family (8183 and up, in
+    cm), few or many; a declared maximum range counts too.
     """
-    readings = np.concatenate([np.asarray(s, dtype=np.float64) for s in scans]) if len(scans) else np.zeros(0)
-    readings = readings[np.isfinite(readings) & (readings > 0.0)]
+    scans = [np.asarray(s, dtype=np.float64) for s in scans]
+    beams = np.concatenate([np.arange(len(s)) for s in scans]) if scans else np.zeros(0, dtype=np.int64)
+    readings = np.concatenate(scans) if scans else np.zeros(0)
+    real = np.isfinite(readings) & (readings > 0.0)
+    readings, beams = readings[real], beams[real]
     candidates = [81.825]
     if declared_max_m is not None and declared_max_m > 0.0:
         candidates.append(declared_max_m - 0.005)
-    if len(readings):
-        candidates.extend(_needles(readings))
+    if len(readings) and readings.max() >= SHORTEST_LIMIT_M:
+        candidates.extend(_needles(readings, beams))
     threshold = min(candidates)
     return threshold if np.any(readings >= threshold) else np.inf
 
 
-def _needles(readings: F64) -> list[float]:
+def _needles(readings: F64, beams: NDArray[np.int64]) -> list[float]:
     largest = float(readings.max())
-    far = np.rint(readings[readings >= 0.97 * largest - 0.1] * 100.0).astype(np.int64)
-    first = int(far.min())
-    count = np.bincount(far - first)
+    far = readings >= 0.97 * largest - 0.1
+    bins = np.rint(readings[far] * 100.0).astype(np.int64)
+    first = int(bins.min())
+    count = np.bincount(bins - first)
     fluke = max(10, len(readings) // 10000)
+    wide = max(3, (int(beams.max()) + 1) // 30)
     found = []
     for k in np.flatnonzero(count >= fluke):
-        if first + k < 97.0 * largest:
-            continue
         near = int(count[max(0, k - 1) : k + 2].sum())
         around = int(count[max(0, k - 10) : k + 11].sum()) - near
-        if near >= 3 * around:
+        everywhere = len(np.unique(beams[far][bins == first + k])) >= wide
+        at_end = first + k >= 97.0 * largest
+        if at_end and near >= 3 * around and everywhere and count[k] < 0.95 * len(readings):
             found.append((first + int(k)) / 100.0 - 0.005)
     return found
 

@@ -188,6 +188,10 @@ def test_a_needle_at_the_far_end_is_no_echo_and_a_wall_is_not() -> None:
     with_misses = [np.where(random.random(180) < 0.02, 29.99, r) for r in room]
     assert no_echo_threshold(with_misses) == pytest.approx(29.985)
     assert no_echo_threshold([np.array([1.0, 81.9])]) < 81.9
+    assert no_echo_threshold([np.full(180, 1.5)] * 5) == math.inf, "close by all round is not nothing all round"
+    assert no_echo_threshold([np.full(180, 9.5)] * 50) == math.inf
+    standing = [np.append(np.linspace(1.0, 9.0, 179), 9.5)] * 500
+    assert no_echo_threshold(standing) == math.inf, "one beam that meets a far wall again and again"
     assert no_echo_threshold([np.array([1.0, 7.0])], declared_max_m=7.0) < 7.0
     assert no_echo_threshold([]) == math.inf
 
