@@ -42,7 +42,9 @@ _PDO_DISABLED = 1 << 31
 _FULL_RANGE = 1 << 32
 
 _HEARTBEAT_MS = 100
-_LIFE_NS = 3 * _HEARTBEAT_MS * 1_000_000
+# Missing readings are noticed after 200 ms. A node is given up, and with it the run of its count, only after five
+# heartbeats: until then it may have been the bus or this machine that paused.
+_LIFE_NS = 5 * _HEARTBEAT_MS * 1_000_000
 _SEARCH_PERIOD_NS = 250_000_000
 _REFUSED_RETRY_NS = 1_000_000_000
 _START_REPEAT_NS = 300_000_000

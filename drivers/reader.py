@@ -3,7 +3,8 @@
 One thread per wire; several conversations may share a CAN wire, each then sees every frame. The loop never gives up:
 
     port cannot be opened or is lost   ABSENT at once; tried again after 0.1 s, later up to 1 s, for ever
-    no reading within silence_limit    SILENT; the conversation starts from reset, again after 0.1 s to 1 s if need be
+    no reading within silence_limit    SILENT at once, while it goes on asking; after 0.4 s more it starts from reset,
+                                       then again after up to 1 s each
     set-up takes for ever              the conversation starts from reset after 10 s
     an exception in a conversation     a bug: logged with its traceback, counted, that conversation alone restarts
 
@@ -31,6 +32,8 @@ Sink = Callable[[str, Reading | DeviceEvent], None]
 POLL_PERIOD_NS = 20_000_000  # requests() is called at least so often
 _FIRST_BACKOFF_NS = 100_000_000
 _LONGEST_BACKOFF_NS = 1_000_000_000
+_SILENCE_PATIENCE_NS = 400_000_000  # a device that only paused keeps its set-up, and wheels their count
+_OWN_PAUSE_NS = 30_000_000  # so much later than it should be, the loop itself was held up
 _SETUP_LIMIT_NS = 10_000_000_000
 _EVENT_PERIOD_NS = 1_000_000_000  # between two events that tell the same state in other words
 _LOG_PERIOD_NS = 60_000_000_000
@@ -103,6 +106,7 @@ class WireReader(Generic[WireT]):
         self._openings = 0
         self._backoff = _Backoff()
         self._heard_ns = 0
+        self._turned_ns = 0  # when the loop last had its turn
         self._thread: threading.Thread | None = None
         self._log = _RateLimitedLog()
         self._sources: list[_Source[WireT]] = [
@@ -166,6 +170,7 @@ class WireReader(Generic[WireT]):
                 now_ns = self._clock()
                 for source in self._sources:
                     self._send(port, source.requests(now_ns), now_ns)
+                self._forgive_own_pause()
                 for source in self._sources:
                     source.check(now_ns)
         except PortError as error:
@@ -205,6 +210,7 @@ class WireReader(Generic[WireT]):
             self._openings += 1
             now_ns = self._clock()
             self._heard_ns = now_ns
+            self._turned_ns = now_ns
             for source in self._sources:
                 source.opened(now_ns)
 
@@ -223,6 +229,15 @@ class WireReader(Generic[WireT]):
                 source.receive(item, stamp_ns)
         if items:
             self._backoff.reset()
+
+    def _forgive_own_pause(self) -> None:
+        """Time in which this thread did not run, and so could not ask, is no device's silence."""
+        now_ns = self._clock()
+        pause_ns = now_ns - self._turned_ns - POLL_PERIOD_NS
+        self._turned_ns = now_ns
+        if pause_ns > _OWN_PAUSE_NS:
+            for source in self._sources:
+                source.forgive(pause_ns)
 
     def _send(self, port: Port[WireT], items: Iterable[WireT | SetBaudRate], now_ns: int) -> None:
         for item in items:
@@ -300,6 +315,10 @@ class _Source(Generic[WireT]):
         self._broken_until_ns = None
         self._restart(now_ns)
         self._tell_safely(now_ns)
+
+    def forgive(self, pause_ns: int) -> None:
+        self._alive_ns += pause_ns
+        self._setup_ns += pause_ns
 
     def lost(self, now_ns: int, why: str) -> None:
         self._wire_trouble = why
@@ -392,7 +411,8 @@ class _Source(Generic[WireT]):
             silence_ns = now_ns - self._alive_ns
             if silence_ns >= limit_ns:
                 self._loop_trouble = f"no reading for {silence_ns / 1e9:.2f} s: check its power and cable"
-                self._restart_when_due(now_ns)
+                if silence_ns >= limit_ns + _SILENCE_PATIENCE_NS:
+                    self._restart_when_due(now_ns)
             else:
                 self._loop_trouble = None
         elif now_ns - self._setup_ns > _SETUP_LIMIT_NS:

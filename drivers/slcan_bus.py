@@ -59,6 +59,7 @@ class LawicelBus(can.BusABC):
         self._buffer = bytearray()
         self._frames: deque[can.Message] = deque()
         self._refusals = 0
+        self._answered = False  # refusals before anything else are to closing what was not open
         self._line.discard_input()
         # Empty lines end whatever the adapter had half received; it may be open still, so close it first.
         self._line.write(f"\r\r\rC\r{_RATE_COMMANDS[bitrate_bps]}\rO\r".encode())
@@ -108,6 +109,7 @@ class LawicelBus(can.BusABC):
             return
         if line in (b"", b"z", b"Z"):
             self._refusals = 0
+            self._answered = True
             return
         frame = decode_line(line)
         if frame is None:
@@ -115,6 +117,7 @@ class LawicelBus(can.BusABC):
                 self._count("slcan_malformed")
             return
         self._refusals = 0
+        self._answered = True
         if len(self._frames) >= _MOST_QUEUED:
             self._count("slcan_overrun")
             self._frames.popleft()
@@ -130,7 +133,8 @@ class LawicelBus(can.BusABC):
         )
 
     def _note_refusal(self) -> None:
-        self._count("slcan_refused")
+        if self._answered:
+            self._count("slcan_refused")
         self._refusals += 1
         if self._refusals >= _REFUSALS:
             self._refusals = 0

@@ -510,7 +510,7 @@ def test_a_lost_node_is_noticed_by_its_heartbeat_and_comes_back() -> None:
     bench = Bench()
     bench.run(300)
     bench.nodes[0].powered = False
-    bench.run(400)
+    bench.run(520)
     assert bench.state() is LinkState.SILENT
     assert "20h" in (bench.pair.trouble or "")
     bench.nodes[0].powered = True
@@ -520,6 +520,18 @@ def test_a_lost_node_is_noticed_by_its_heartbeat_and_comes_back() -> None:
     assert all(reading.continuous for reading in readings[1:])
     assert len(readings) > 80
     assert bench.drops["node_lost"] == 1
+
+
+def test_a_short_pause_keeps_the_count() -> None:
+    bench = Bench()
+    before = bench.run(300, move=(4, -4))[-1]
+    bench.lost = lambda frame: True
+    bench.run(400, move=(4, -4))
+    bench.lost = lambda frame: False
+    after = bench.run(100, move=(4, -4))
+    assert after[0].continuous
+    elapsed_ms = round((after[0].stamp_ns - before.stamp_ns) / MS)
+    assert after[0].left_ticks - before.left_ticks == 4 * elapsed_ms
 
 
 def test_a_node_that_boots_is_set_up_again_and_its_count_is_not_motion() -> None:

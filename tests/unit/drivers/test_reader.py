@@ -244,25 +244,51 @@ def test_silence_is_told_in_time_and_the_conversation_starts_anew() -> None:
     bench = Bench()
     bench.say_from_to(50, 1000)
     bench.run_until(3000)
-    told_ms, state, text = bench.events()[-1]
+    told_ms, state, text = bench.events()[1 + bench.states().index(LinkState.RUNNING)]
     assert state is LinkState.SILENT
     assert told_ms - 950 <= 300 + 20
     assert "no reading for" in text
-    assert bench.talker.connected_at[1] == told_ms * MS, "at once, as reset and resynchronisation"
+    assert bench.talker.connected_at[1] - told_ms * MS == pytest.approx(400 * MS, abs=20 * MS)
     bench.say_from_to(3000, 4000)
     bench.run_until(4000)
     assert bench.states()[-1] is LinkState.RUNNING
-    assert bench.reader.health().sources["front"].restarts == 2
+
+
+def test_a_pause_is_told_but_costs_no_reset() -> None:
+    """Wheels keep their count: it went on while nothing was heard."""
+    bench = Bench()
+    bench.say_from_to(50, 1000)
+    bench.say_from_to(1500, 3000)
+    bench.run_until(3000)
+    assert bench.states() == [LinkState.SILENT, LinkState.RUNNING, LinkState.SILENT, LinkState.RUNNING]
+    assert len(bench.talker.connected_at) == 1
+
+
+def test_our_own_pause_is_no_silence_of_the_device() -> None:
+    """This thread did not run for 2 s, so it did not ask: the device could not answer."""
+    bench = Bench()
+    bench.say_from_to(50, 1000)
+
+    def pause() -> None:
+        bench.now_ns += 2_000 * MS
+
+    bench.plan.append((1000 * MS, pause))
+    bench.say_from_to(3050, 4000)
+    bench.run_until(4000)
+    assert bench.states() == [LinkState.SILENT, LinkState.RUNNING]
+    bench.run_until(4500)
+    assert bench.states()[-1] is LinkState.SILENT
 
 
 def test_a_device_that_comes_and_goes_is_not_restarted_in_a_rush() -> None:
-    """A reading every 400 ms with a limit of 300 ms: restarts wait longer and longer, but never end."""
+    """A reading every 800 ms with a limit of 300 ms: restarts wait longer and longer, but never end."""
     bench = Bench()
-    bench.say_from_to(0, 20_000, 400)
+    bench.say_from_to(0, 20_000, 800)
     bench.run_until(20_000)
     gaps = [b - a for a, b in pairwise(bench.talker.connected_at)]
-    assert min(gaps[5:]) >= 390 * MS
-    assert max(gaps) <= 1_500 * MS
+    assert len(gaps) > 10
+    assert min(gaps[5:]) >= 790 * MS
+    assert max(gaps) <= 2_000 * MS
     assert bench.states()[-1] in (LinkState.SILENT, LinkState.RUNNING)
 
 
@@ -337,10 +363,8 @@ def test_port_drops_survive_reopening() -> None:
 def test_a_bug_in_one_conversation_hurts_no_other(where: str, caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench("front", "rear")
     bench.say_from_to(50, 10_000)
-    bench.run_until(500)
+    bench.run_until(0 if where == "connected" else 500)
     bench.talkers["front"].fail_in = where
-    if where == "connected":
-        bench.talkers["front"].silence_limit_ns = 1  # makes the loop restart it
     with caplog.at_level(logging.ERROR):
         bench.run_until(5_000)
     assert bench.readings("rear") == 50
@@ -352,7 +376,6 @@ def test_a_bug_in_one_conversation_hurts_no_other(where: str, caplog: pytest.Log
     tracebacks = [record for record in caplog.records if record.exc_info]
     assert len(tracebacks) == 1, "one a minute"
     bench.talkers["front"].fail_in = None
-    bench.talkers["front"].silence_limit_ns = 300 * MS
     bench.run_until(7_000)
     assert bench.states()[-1] is LinkState.RUNNING
 
