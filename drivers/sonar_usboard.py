@@ -58,6 +58,7 @@ _LISTEN_PATIENCE_NS = 1_000_000_000
 _SETUP_PATIENCE_NS = 2_500_000_000  # the slowest automatic sending is every 2 s
 _SLOWEST_LISTENING_S = 0.16  # three intervals must fit in the 500 ms within which silence has to be noticed
 _LEGACY_AFTER = 3  # GET_DATA unanswered so often: perhaps an old board
+_MISSED_ROUNDS = 2  # so often the others answered without this group
 _DEFAULT_FIRE_NS = 20_000_000
 _LEAST_SILENCE_NS = 200_000_000  # a pause of the interpreter is no lost device
 _MOST_SILENCE_NS = 500_000_000
@@ -83,6 +84,7 @@ class _Progress:
     request_due_ns: int = 0
     analog_due_ns: int = 0
     group_seen_ns: dict[int, int] = field(default_factory=dict)
+    frames_since: dict[int, int] = field(default_factory=dict)  # of other groups, since this one was heard
     silent_groups: set[int] = field(default_factory=set)
     unconnected: set[int] = field(default_factory=set)
 
@@ -347,7 +349,9 @@ class _Board:
         readings = []
         for group in self._groups:
             seen_ns = now.group_seen_ns.setdefault(group, stamp_ns)
-            if group in now.silent_groups or stamp_ns - seen_ns <= self.silence_limit_ns:
+            now.frames_since[group] = now.frames_since.get(group, 0) + 1 if seen_ns < stamp_ns else 0
+            passed_over = now.frames_since[group] > _MISSED_ROUNDS * (len(self._groups) - 1)  # not: all paused
+            if group in now.silent_groups or not passed_over or stamp_ns - seen_ns <= self.silence_limit_ns:
                 continue
             now.silent_groups.add(group)
             self.counters.drop("group_silent")

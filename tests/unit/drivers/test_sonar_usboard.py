@@ -448,6 +448,16 @@ def test_a_group_that_falls_silent_goes_stale_while_others_go_on() -> None:
     assert conversation.trouble is None
 
 
+def test_a_pause_of_the_whole_board_makes_no_single_group_stale() -> None:
+    board = ScriptedBoard()
+    conversation = UsBoardConversation()
+    conversation.connected(0)
+    converse(conversation, board, 0, 500 * MS)
+    converse(conversation, None, 500 * MS, 1_000 * MS)
+    readings = converse(conversation, board, 1_000 * MS, 1_500 * MS)
+    assert {each.status for each in ranges_of(readings)} == {RangeStatus.ECHO}
+
+
 def test_two_boards_do_not_disturb_each_other() -> None:
     boards = [ScriptedBoard(base_id=0x400), ScriptedBoard(base_id=0x420)]
     boards[1].raw = 250
