@@ -1,0 +1,392 @@
+"""Compiled loops of scan matching: a scan as a table of bearings, its surface normals, and point-to-line alignment.
+
+A scan is kept as a table of bearing bins ("view"), so that the neighbours of a point in another scan are found by
+its bearing there and not by a tree. A view's arrays are (B,) float32, a store of views has them as (K, B):
+
+    x, y     mean end point of the beams in the bin, sensor frame [m]; 0 where the bin is empty
+    nx, ny   unit normal of the surface there, towards the sensor; 0 where there is none
+    quality  EMPTY no point, 0 a point without a normal, up to 1 a point on a straight surface
+    frame    (4,) float64 of a view: bearing of the first bin's lower edge, width of a bin, bins, 1 if they close a turn
+
+Poses are rows (x, y, yaw) in float64. Bounds: every index is clipped or wrapped before it is used.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+EMPTY = -1.0
+FIRST, WIDTH, BINS, CLOSED = 0, 1, 2, 3
+
+NEIGHBOURS = 8  # points on either side that may define a normal
+WIDEST_BINS = 24.0  # half of the widest window of bearings that is searched
+FACING = 0.6  # cosine: surfaces that meet under a larger angle are not the same one
+
+LEVELS = 4
+RESULT_POSE, RESULT_HESSIAN, RESULT_COST, RESULT_COUNT, RESULT_STEPS, RESULT_LENGTH = 0, 3, 9, 10, 11, 12
+
+
+@njit(cache=True, nogil=True)
+def bearing_of(x: float, y: float) -> float:
+    """atan2(y, x) to within 1e-5 rad, several times as fast; 0 for the origin."""
+    ax, ay = abs(x), abs(y)
+    high, low = max(ax, ay), min(ax, ay)
+    if high == 0.0:
+        return 0.0
+    a = low / high
+    s = a * a
+    angle = a + a * s * (-0.332966 + s * (0.1951828 + s * (-0.1198186 + s * (0.0558058 - s * 0.0128082))))
+    if ay > ax:
+        angle = 0.5 * math.pi - angle
+    if x < 0.0:
+        angle = math.pi - angle
+    return -angle if y < 0.0 else angle
+
+
+@njit(cache=True, nogil=True)
+def bin_of(bearing: float, frame: Any) -> Any:
+    """Bin of a bearing, whole turns taken off; may lie outside an open table."""
+    turn = 2.0 * math.pi
+    behind = bearing - frame[FIRST]
+    middle = 0.5 * frame[BINS] * frame[WIDTH]
+    behind -= turn * math.floor((behind - middle) / turn + 0.5)
+    return math.floor(behind / frame[WIDTH])
+
+
+@njit(cache=True, nogil=True)
+def fill_table(
+    bearing: Any, distance: Any, nearest_m: float, farthest_m: float, frame: Any, x: Any, y: Any, quality: Any
+) -> int:
+    """Beams (N,) into a view: of each bin the nearest surface, the mean of its beams. Returns the number of points.
+
+    The mean of points of one straight surface lies on that surface, so nothing is biased by averaging.
+    """
+    bins = int(frame[BINS])
+    front = np.full(bins, np.inf)
+    share = np.zeros(bins, dtype=np.int64)
+    for b in range(len(x)):
+        x[b] = 0.0
+        y[b] = 0.0
+        quality[b] = EMPTY
+    at = np.full(len(bearing), -1, dtype=np.int64)
+    for i in range(len(bearing)):
+        r = distance[i]
+        if not (r >= nearest_m and r <= farthest_m) or not math.isfinite(bearing[i]):
+            continue
+        b = bin_of(bearing[i], frame)
+        if 0 <= b < bins:
+            at[i] = b
+            front[b] = min(front[b], r)
+    sum_x, sum_y = np.zeros(bins), np.zeros(bins)
+    for i in range(len(bearing)):
+        b = at[i]
+        if b >= 0 and distance[i] <= front[b] + 0.05 + 0.01 * front[b]:
+            sum_x[b] += distance[i] * math.cos(bearing[i])
+            sum_y[b] += distance[i] * math.sin(bearing[i])
+            share[b] += 1
+    count = 0
+    for b in range(bins):
+        if share[b] > 0:
+            x[b] = sum_x[b] / share[b]
+            y[b] = sum_y[b] / share[b]
+            quality[b] = 0.0
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def surface_normals(x: Any, y: Any, frame: Any, nx: Any, ny: Any, quality: Any, roughness_m: float) -> int:
+    """Normals of a view by principal components of each point's neighbours on the same surface; how many were found.
+
+    Neighbours are walked to on both sides while each lies near the one before it, within reach of the point. A point
+    whose neighbours are no line (second deviation above a third of the first) keeps quality 0.
+    """
+    bins = int(frame[BINS])
+    closed = frame[CLOSED] > 0.0
+    found = 0
+    for i in range(len(x)):
+        nx[i] = 0.0
+        ny[i] = 0.0
+    for i in range(bins):
+        if quality[i] == EMPTY:
+            continue
+        px, py = np.float64(x[i]), np.float64(y[i])
+        spacing = math.sqrt(px * px + py * py) * frame[WIDTH]
+        gap = min(max(0.12, 3.0 * spacing), 0.8)
+        reach = max(0.15, 2.5 * spacing)
+        count, sx, sy, sxx, sxy, syy = 1, 0.0, 0.0, 0.0, 0.0, 0.0
+        for side in (-1, 1):
+            last_x, last_y, k = px, py, i
+            for _ in range(NEIGHBOURS):
+                k += side
+                if closed:
+                    k = (k + bins) % bins
+                elif k < 0 or k >= bins:
+                    break
+                if quality[k] == EMPTY:
+                    continue
+                dx, dy = x[k] - px, y[k] - py
+                if (x[k] - last_x) ** 2 + (y[k] - last_y) ** 2 > gap * gap or dx * dx + dy * dy > reach * reach:
+                    break
+                last_x, last_y = np.float64(x[k]), np.float64(y[k])
+                count += 1
+                sx += dx
+                sy += dy
+                sxx += dx * dx
+                sxy += dx * dy
+                syy += dy * dy
+        if count < 3:
+            continue
+        mx, my = sx / count, sy / count
+        a, b, d = sxx / count - mx * mx, sxy / count - mx * my, syy / count - my * my
+        along = 0.5 * math.atan2(2.0 * b, a - d)
+        root = math.sqrt(0.25 * (a - d) ** 2 + b * b)
+        large, small = 0.5 * (a + d) + root, max(0.5 * (a + d) - root, 0.0)
+        if large <= 1e-9 or small > 0.12 * large:
+            continue
+        normal_x, normal_y = -math.sin(along), math.cos(along)
+        if normal_x * px + normal_y * py > 0.0:
+            normal_x, normal_y = -normal_x, -normal_y
+        nx[i] = normal_x
+        ny[i] = normal_y
+        quality[i] = 1.0 / (1.0 + small / (roughness_m * roughness_m))
+        found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def nearest_bin(px: float, py: float, reach_m: float, coarse: bool, x: Any, y: Any, quality: Any, frame: Any) -> int:
+    """The bin of a view whose point with a normal lies nearest to (px, py), within reach_m; -1 if none does.
+
+    Points within reach lie within asin(reach / range) of its bearing. coarse: every other bin of wide windows only.
+    """
+    bins = int(frame[BINS])
+    r = math.sqrt(px * px + py * py)
+    half = WIDEST_BINS
+    if r > reach_m:
+        half = min(half, 1.05 * reach_m / (r * frame[WIDTH]) + 0.5)
+    middle = bin_of(bearing_of(px, py), frame)
+    low, high = middle - int(half), middle + int(half)
+    if frame[CLOSED] == 0.0:
+        low, high = max(low, 0), min(high, bins - 1)
+    step = 2 if coarse and half > 5.0 else 1
+    best, at = reach_m * reach_m, -1
+    for k in range(low, high + 1, step):
+        b = k
+        if b < 0:
+            b += bins
+        elif b >= bins:
+            b -= bins
+        if quality[b] <= 0.0:
+            continue
+        dx, dy = x[b] - px, y[b] - py
+        square = dx * dx + dy * dy
+        if square < best:
+            best, at = square, b
+    return at
+
+
+@njit(cache=True, nogil=True)
+def add_pair(
+    sx: Any, sy: Any, snx: Any, sny: Any, squality: Any, stride: int, offset: int,
+    x: Any, y: Any, nx: Any, ny: Any, quality: Any, frame: Any,
+    dx: float, dy: float, turn: float, reach_m: float, scale_m: float, coarse: bool, sums: Any,
+) -> None:  # fmt: skip
+    """Add one pair of views to the normal equations of (dx, dy, turn), the source's pose in the reference's frame.
+
+    sums: (11,) upper triangle of H (6), gradient (3), robust cost, number of correspondences. Weights are those of
+    Geman and McClure: (s^2 / (s^2 + e^2))^2 with s = scale_m, e the distance from the reference's tangent line.
+    """
+    c, s = math.cos(turn), math.sin(turn)
+    square = scale_m * scale_m
+    for i in range(offset, len(sx), stride):
+        if squality[i] == EMPTY:
+            continue
+        rx, ry = c * sx[i] - s * sy[i], s * sx[i] + c * sy[i]
+        px, py = rx + dx, ry + dy
+        b = nearest_bin(px, py, reach_m, coarse, x, y, quality, frame)
+        if b < 0:
+            continue
+        ux, uy = np.float64(nx[b]), np.float64(ny[b])
+        if squality[i] > 0.0 and (c * snx[i] - s * sny[i]) * ux + (s * snx[i] + c * sny[i]) * uy < FACING:
+            continue
+        e = (px - x[b]) * ux + (py - y[b]) * uy
+        inside = square / (square + e * e)
+        w = quality[b] * inside * inside
+        j = rx * uy - ry * ux
+        sums[0] += w * ux * ux
+        sums[1] += w * ux * uy
+        sums[2] += w * ux * j
+        sums[3] += w * uy * uy
+        sums[4] += w * uy * j
+        sums[5] += w * j * j
+        sums[6] += w * ux * e
+        sums[7] += w * uy * e
+        sums[8] += w * j * e
+        sums[9] += 1.0 - inside
+        sums[10] += 1.0
+
+
+@njit(cache=True, nogil=True)
+def add_turned(sums: Any, yaw: float, total: Any) -> None:
+    """Add sums of add_pair, whose translations are in a frame turned by yaw, to totals in the outer frame."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    total[0] += c * c * sums[0] - 2.0 * c * s * sums[1] + s * s * sums[3]
+    total[1] += c * s * (sums[0] - sums[3]) + (c * c - s * s) * sums[1]
+    total[2] += c * sums[2] - s * sums[4]
+    total[3] += s * s * sums[0] + 2.0 * c * s * sums[1] + c * c * sums[3]
+    total[4] += s * sums[2] + c * sums[4]
+    total[5] += sums[5]
+    total[6] += c * sums[6] - s * sums[7]
+    total[7] += s * sums[6] + c * sums[7]
+    total[8] += sums[8]
+    total[9] += sums[9]
+    total[10] += sums[10]
+
+
+@njit(cache=True, nogil=True)
+def solve3(h: Any, g: Any, out: Any) -> bool:
+    """out = H^-1 g for H (3, 3) positive definite given in full; False if it is not. Cholesky."""
+    if not h[0, 0] > 0.0:
+        return False
+    l00 = math.sqrt(h[0, 0])
+    l10, l20 = h[1, 0] / l00, h[2, 0] / l00
+    d = h[1, 1] - l10 * l10
+    if not d > 0.0:
+        return False
+    l11 = math.sqrt(d)
+    l21 = (h[2, 1] - l20 * l10) / l11
+    d = h[2, 2] - l20 * l20 - l21 * l21
+    if not d > 0.0:
+        return False
+    l22 = math.sqrt(d)
+    a = g[0] / l00
+    b = (g[1] - l10 * a) / l11
+    e = (g[2] - l20 * a - l21 * b) / l22
+    out[2] = e / l22
+    out[1] = (b - l21 * out[2]) / l11
+    out[0] = (a - l10 * out[1] - l20 * out[2]) / l00
+    return True
+
+
+@njit(cache=True, nogil=True)
+def align(
+    sx: Any, sy: Any, snx: Any, sny: Any, squality: Any,
+    x: Any, y: Any, nx: Any, ny: Any, quality: Any, frames: Any, rows: Any, poses: Any,
+    guess: Any, prior: Any, reach_m: Any, scale_m: Any, most_steps: int, result: Any,
+) -> None:  # fmt: skip
+    """Pose of a source view that lays it on several reference views at once (point to line, Gauss-Newton).
+
+    rows: (R,) which views of the store are references; poses: (R, 3) theirs.  guess: (3,).  prior: (3, 3) weight of
+    staying at the guess, in points.  reach_m, scale_m: (LEVELS,) from coarse to fine; the coarse levels see every
+    other point and reference, and are left as soon as steps are small.
+    result: (RESULT_LENGTH,) pose, upper triangle of H in points, robust cost, correspondences, steps (-1: failed).
+    """
+    pose = guess.copy()
+    total, sums = np.zeros(11), np.zeros(11)
+    h, g, step = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    level = 0
+    for done in range(most_steps):
+        last = level == LEVELS - 1
+        stride = 1 if last or len(sx) < 120 else 2
+        total[:] = 0.0
+        for k in range(0, len(rows), 1 if last or len(rows) < 4 else 2):
+            row = rows[k] if last else rows[len(rows) - 1 - k]
+            ref = poses[k] if last else poses[len(rows) - 1 - k]
+            c, s = math.cos(ref[2]), math.sin(ref[2])
+            dx, dy = pose[0] - ref[0], pose[1] - ref[1]
+            sums[:] = 0.0
+            add_pair(
+                sx, sy, snx, sny, squality, stride, done % stride,
+                x[row], y[row], nx[row], ny[row], quality[row], frames[row],
+                c * dx + s * dy, c * dy - s * dx, pose[2] - ref[2], reach_m[level], scale_m[level], not last, sums,
+            )  # fmt: skip
+            add_turned(sums, ref[2], total)
+        weight = scale_m[level] * scale_m[level] / (scale_m[LEVELS - 1] * scale_m[LEVELS - 1])
+        if not last:
+            weight *= 0.25  # a quarter of the pairs
+        h[0, 0], h[0, 1], h[0, 2] = total[0], total[1], total[2]
+        h[1, 0], h[1, 1], h[1, 2] = total[1], total[3], total[4]
+        h[2, 0], h[2, 1], h[2, 2] = total[2], total[4], total[5]
+        for a in range(3):
+            g[a] = total[6 + a]
+            for b in range(3):
+                h[a, b] += weight * prior[a, b]
+                g[a] += weight * prior[a, b] * (pose[b] - guess[b])
+            h[a, a] += 1e-6
+        if not solve3(h, g, step):
+            result[RESULT_STEPS] = -1.0
+            return
+        for a in range(3):
+            pose[a] -= step[a]
+        moved = math.sqrt(step[0] * step[0] + step[1] * step[1]) + 3.0 * abs(step[2])
+        result[RESULT_STEPS] = done + 1.0
+        if not last:
+            level = LEVELS - 1 if moved < 0.04 else level + 1
+        elif moved < 4e-4:
+            break
+    for a in range(3):
+        result[RESULT_POSE + a] = pose[a]
+    for a in range(6):
+        result[RESULT_HESSIAN + a] = total[a]
+    result[RESULT_COST] = total[9]
+    result[RESULT_COUNT] = total[10]
+
+
+@njit(cache=True, nogil=True)
+def compare(
+    sx: Any, sy: Any, squality: Any, x: Any, y: Any, quality: Any, frames: Any, rows: Any, poses: Any, pose: Any,
+    near_m: float, votes: Any,
+) -> None:  # fmt: skip
+    """How a view at `pose` (3,) agrees with reference views: votes (3,) points explained, refuted, unseen.
+
+    A point is explained if some reference has a point within near_m (growing with the spacing of its beams). It is
+    refuted if none has, and some reference's beam through its bearing (and both neighbours) ended well behind it:
+    that reference saw through the surface. It is unseen if no reference looked there or all saw something nearer.
+    """
+    for i in range(len(sx)):
+        if squality[i] == EMPTY:
+            continue
+        explained, refuted = False, False
+        for k in range(len(rows)):
+            ref, row = poses[k], rows[k]
+            frame = frames[row]
+            bins = int(frame[BINS])
+            c, s = math.cos(ref[2]), math.sin(ref[2])
+            ct, st = math.cos(pose[2] - ref[2]), math.sin(pose[2] - ref[2])
+            ox, oy = pose[0] - ref[0], pose[1] - ref[1]
+            px = ct * sx[i] - st * sy[i] + c * ox + s * oy
+            py = st * sx[i] + ct * sy[i] + c * oy - s * ox
+            r = math.sqrt(px * px + py * py)
+            near = near_m + 0.5 * r * frame[WIDTH]
+            middle = bin_of(bearing_of(px, py), frame)
+            half = min(WIDEST_BINS, near / (max(r, near) * frame[WIDTH]) + 1.0)
+            behind, looked = 0, 0
+            for at in range(middle - int(half), middle + int(half) + 1):
+                b = at
+                if frame[CLOSED] > 0.0:
+                    b = (b + bins) % bins
+                elif b < 0 or b >= bins:
+                    continue
+                if quality[row, b] == EMPTY:
+                    continue
+                if (x[row, b] - px) ** 2 + (y[row, b] - py) ** 2 <= near * near:
+                    explained = True
+                    break
+                if abs(at - middle) <= 1:
+                    looked += 1
+                    far = math.sqrt(x[row, b] ** 2 + y[row, b] ** 2)
+                    behind += far > r + 0.3 + 0.05 * r
+            if explained:
+                break
+            refuted = refuted or (looked == 3 and behind == 3)
+        if explained:
+            votes[0] += 1.0
+        elif refuted:
+            votes[1] += 1.0
+        else:
+            votes[2] += 1.0

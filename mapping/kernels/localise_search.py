@@ -1,0 +1,141 @@
+"""Compiled loops of the correlative search: where in a raster of likelihoods do most end points of a scan fall?
+
+The raster holds uint8 likelihoods of a surface (255 on it, falling off with distance). A pooled copy whose cell holds
+the maximum over the block of cells from it on bounds what any shift within that block can score, so that blocks are
+looked into from the best bound down and most never are. Source: correlative scan matching (Olson, ICRA 2009) with two
+resolutions.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def draw_points(
+    x: Any, y: Any, quality: Any, rows: Any, poses: Any, x0: float, y0: float, resolution_m: float, out: Any
+) -> None:
+    """Draw the points of views `rows` at poses (R, 3) into a raster (H, W) uint8, blurred over two cells."""
+    height, width = out.shape
+    for k in range(len(rows)):
+        c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        for i in range(x.shape[1]):
+            if quality[rows[k], i] < 0.0:
+                continue
+            px = (poses[k, 0] + c * x[rows[k], i] - s * y[rows[k], i] - x0) / resolution_m
+            py = (poses[k, 1] + s * x[rows[k], i] + c * y[rows[k], i] - y0) / resolution_m
+            if not (px >= 2.0 and py >= 2.0 and px < width - 2.0 and py < height - 2.0):
+                continue
+            column, row = int(px), int(py)
+            for v in range(row - 2, row + 3):
+                for u in range(column - 2, column + 3):
+                    square = (u + 0.5 - px) ** 2 + (v + 0.5 - py) ** 2
+                    value = int(255.0 * math.exp(-0.5 * square))
+                    if value > out[v, u]:
+                        out[v, u] = value
+
+
+@njit(cache=True, nogil=True)
+def pool(fine: Any, block: int) -> Any:
+    """Raster whose cell (v, u) is the maximum of fine[v : v + block, u : u + block]."""
+    height, width = fine.shape
+    wide = np.zeros_like(fine)
+    for v in range(height):
+        for u in range(width):
+            best = fine[v, u]
+            for k in range(1, min(block, width - u)):
+                best = max(best, fine[v, u + k])
+            wide[v, u] = best
+    out = np.zeros_like(fine)
+    for v in range(height):
+        for k in range(min(block, height - v)):
+            for u in range(width):
+                out[v, u] = max(out[v, u], wide[v + k, u])
+    return out
+
+
+@njit(cache=True, nogil=True)
+def score_at(raster: Any, cx: Any, cy: Any, dx: int, dy: int) -> int:
+    """Sum of likelihoods under points (M,) of cells cx, cy shifted by whole cells."""
+    height, width = raster.shape
+    total = 0
+    for i in range(len(cx)):
+        u, v = cx[i] + dx, cy[i] + dy
+        if u >= 0 and v >= 0 and u < width and v < height:
+            total += raster[v, u]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def search(
+    fine: Any, pooled: Any, block: int, x0: float, y0: float, resolution_m: float, px: Any, py: Any, guess: Any,
+    window_m: float, turn_rad: float, turn_step_rad: float, apart_m: float, apart_rad: float, floor_share: float,
+    result: Any,
+) -> None:  # fmt: skip
+    """Best pose of points (M,) around a guess (3,), and the best of those that lie apart from it.
+
+    result: (5,) x, y, yaw of the best, its score, and the score of the best that is apart_m or apart_rad away (0 if
+    none reaches floor_share of the best's); scores are mean likelihoods in [0, 1].
+    """
+    turns = int(turn_rad / turn_step_rad)
+    blocks = int(math.ceil(window_m / (resolution_m * block)))
+    side = 2 * blocks + 1
+    total = (2 * turns + 1) * side * side
+    bounds = np.empty(total, dtype=np.int64)
+    count = len(px)
+    cells_x, cells_y = (
+        np.empty((2 * turns + 1, count), dtype=np.int64),
+        np.empty((2 * turns + 1, count), dtype=np.int64),
+    )
+    at = 0
+    for t in range(2 * turns + 1):
+        yaw = guess[2] + (t - turns) * turn_step_rad
+        c, s = math.cos(yaw), math.sin(yaw)
+        for i in range(count):
+            cells_x[t, i] = math.floor((guess[0] + c * px[i] - s * py[i] - x0) / resolution_m)
+            cells_y[t, i] = math.floor((guess[1] + s * px[i] + c * py[i] - y0) / resolution_m)
+        for by in range(-blocks, blocks + 1):
+            for bx in range(-blocks, blocks + 1):
+                bounds[at] = score_at(pooled, cells_x[t], cells_y[t], bx * block, by * block)
+                at += 1
+    order = np.argsort(-bounds, kind="mergesort")
+    best, best_t, best_x, best_y = -1, 0, 0, 0
+    for n in range(total):
+        k = order[n]
+        if bounds[k] <= best:
+            break
+        t = k // (side * side)
+        by, bx = (k % (side * side)) // side - blocks, k % side - blocks
+        for dy in range(by * block, by * block + block):
+            for dx in range(bx * block, bx * block + block):
+                score = score_at(fine, cells_x[t], cells_y[t], dx, dy)
+                if score > best:
+                    best, best_t, best_x, best_y = score, t, dx, dy
+    second = int(floor_share * best)
+    found = False
+    apart_cells = apart_m / resolution_m
+    for n in range(total):
+        k = order[n]
+        if bounds[k] <= second:
+            break
+        t = k // (side * side)
+        by, bx = (k % (side * side)) // side - blocks, k % side - blocks
+        turned = abs(t - best_t) * turn_step_rad > apart_rad
+        for dy in range(by * block, by * block + block):
+            for dx in range(bx * block, bx * block + block):
+                if not turned and (dx - best_x) ** 2 + (dy - best_y) ** 2 < apart_cells * apart_cells:
+                    continue
+                score = score_at(fine, cells_x[t], cells_y[t], dx, dy)
+                if score > second:
+                    second = score
+                    found = True
+    scale = 1.0 / (255.0 * max(1, count))
+    result[0] = guess[0] + best_x * resolution_m
+    result[1] = guess[1] + best_y * resolution_m
+    result[2] = guess[2] + (best_t - turns) * turn_step_rad
+    result[3] = best * scale
+    result[4] = second * scale if found else 0.0
