@@ -68,11 +68,14 @@ def centres_of(cells: ArrayLike, resolution_m: float) -> F64:
 
 
 def book_tile_of(position_m: ArrayLike, resolution_m: float) -> I64:
-    """Tile index of the source chapter: i d - d/2 < x <= i d + d/2 (eq. 5.44, 5.45); any shape; errors as cell_of."""
+    """Tile index of the source chapter: i d - d/2 < x <= i d + d/2 (eq. 5.44, 5.45); any shape; errors as cell_of.
+
+    Borders are the doubles i * d + d / 2; the lower one of a tile is the upper one of the tile below.
+    """
     d = check_resolution(resolution_m)
     x = np.asarray(position_m, dtype=np.float64)
     index = cell_of(x + d / 2, d)  # right but for points on or next to a border
-    index = np.where(x <= index * d - d / 2, index - 1, index)
+    index = np.where(x <= (index - 1) * d + d / 2, index - 1, index)
     return np.where(x > index * d + d / 2, index + 1, index)
 
 

@@ -1,0 +1,116 @@
+"""Exact distances, inflated maps, and the cell size of a safety distance (S30)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from mapping.grids.clearance import (
+    cell_size_for_clearance,
+    clearance_layer,
+    clearance_of_cell_size,
+    inflated,
+    squared_cell_distances,
+)
+from mapping.grids.patch import GridPatch
+from mapping.kernels.clearance import FAR
+
+Mask = NDArray[np.bool_]
+
+
+@st.composite
+def masks(draw: st.DrawFn) -> Mask:
+    rows, cols = draw(st.integers(1, 40)), draw(st.integers(1, 40))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return np.asarray(rng.random((rows, cols)) < draw(st.sampled_from([0.0, 0.003, 0.05, 0.5, 1.0])))
+
+
+@settings(max_examples=150, deadline=None)
+@given(masks())
+def test_squared_distances_are_those_of_all_pairs(mask: Mask) -> None:
+    found = squared_cell_distances(mask)
+    obstacles = np.argwhere(mask)
+    if obstacles.size == 0:
+        assert np.all(found == FAR)
+        return
+    cells = np.argwhere(np.ones_like(mask))
+    away = ((cells[:, None] - obstacles[None]) ** 2).sum(axis=2).min(axis=1)
+    assert np.array_equal(found.ravel(), away)
+
+
+def test_large_maps_agree_with_scipy() -> None:
+    rng = np.random.default_rng(1)
+    mask = np.zeros((700, 900), dtype=np.bool_)
+    for _ in range(40):
+        row, col = rng.integers(0, 700), rng.integers(0, 900)
+        mask[row : row + rng.integers(1, 100), col : col + rng.integers(1, 4)] = True
+    mask[:, 300:420] = False
+    assert np.array_equal(squared_cell_distances(mask), np.rint(distance_transform_edt(~mask) ** 2))
+
+
+def test_a_long_thin_map_with_one_obstacle() -> None:
+    mask = np.zeros((2, 15_000), dtype=np.bool_)
+    mask[1, 14_999] = True
+    found = squared_cell_distances(mask)
+    assert found[0, 0] == 14_999**2 + 1
+    assert found[1, 14_999] == 0
+
+
+def test_empty_and_wrong_shapes() -> None:
+    assert squared_cell_distances(np.zeros((0, 5), dtype=np.bool_)).shape == (0, 5)
+    assert squared_cell_distances(np.zeros((5, 0), dtype=np.bool_)).shape == (5, 0)
+    with pytest.raises(ValueError, match="obstacles"):
+        squared_cell_distances(np.zeros(5, dtype=np.bool_))
+    with pytest.raises(ValueError, match="sides"):
+        squared_cell_distances(np.zeros((1, 20_001), dtype=np.bool_))
+
+
+def patch_of(cells: list[list[int]], resolution_m: float = 0.1) -> GridPatch:
+    return GridPatch(resolution_m, -2, 5, np.array(cells, dtype=np.int8))
+
+
+def test_the_clearance_layer_is_in_metres_and_knows_no_obstacle_as_inf() -> None:
+    layer = clearance_layer(patch_of([[100, 0, -1], [0, 0, 64]]))
+    assert layer == pytest.approx(0.1 * np.array([[0.0, 1.0, 2.0], [1.0, math.sqrt(2.0), math.sqrt(5.0)]]))
+    assert np.all(np.isinf(clearance_layer(patch_of([[0, -1]]))))
+    assert clearance_layer(patch_of([[0, -1]]), unknown_is_obstacle=True) == pytest.approx(np.array([[0.1, 0.0]]))
+    assert clearance_layer(patch_of([[0, 64]]), occupied_percent=60)[0, 0] == pytest.approx(0.1)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(masks(), st.floats(0.0, 0.8), st.integers(0, 2**32 - 1))
+def test_a_disc_in_a_cell_left_free_touches_no_obstacle(mask: Mask, radius_m: float, seed: int) -> None:
+    d = 0.1
+    rng = np.random.default_rng(seed)
+    cells = np.where(mask, 100, rng.choice([-1, 0, 50], mask.shape)).astype(np.int8)
+    grown = inflated(GridPatch(d, 0, 0, cells), radius_m)
+    kept = grown.cells != 100
+    assert np.array_equal(grown.cells[kept], cells[kept])
+    assert np.all(grown.cells[mask] == 100)
+    obstacles = np.argwhere(mask)
+    if obstacles.size == 0:
+        return
+    for row, col in np.argwhere(kept)[:50]:
+        place = (np.array([row, col]) + rng.random(2)) * d
+        nearest = np.clip(place, obstacles * d, (obstacles + 1) * d)
+        assert np.hypot(*(nearest - place).T).min() >= radius_m - 1e-9 or radius_m == 0.0
+
+
+@pytest.mark.parametrize("radius_m", [-0.1, math.nan, math.inf])
+def test_radii_that_are_no_length_are_refused(radius_m: float) -> None:
+    with pytest.raises(ValueError, match="radius"):
+        inflated(patch_of([[100]]), radius_m)
+
+
+def test_the_cell_size_of_the_book() -> None:
+    """n = 7 cm gives cells of 5 cm, 400 of them a square metre."""
+    assert cell_size_for_clearance(0.07) == pytest.approx(0.05, abs=1e-3)
+    assert clearance_of_cell_size(cell_size_for_clearance(0.3)) == pytest.approx(0.3)
+    with pytest.raises(ValueError, match="positive"):
+        cell_size_for_clearance(0.0)
