@@ -159,6 +159,26 @@ def clip_to_wedge(
 
 
 @njit(cache=True, nogil=True)
+def star_border(lo: Any, hi: Any, length: Any, x: float, y: float, yaw: float) -> Any:
+    """(M, 2) corners of the union of thin sectors about (x, y), ascending and apart, with chords for arcs.
+
+    Where two do not touch, the border goes home to (x, y) and out again.
+    """
+    corners = np.empty((3 * len(lo), 2))
+    count = 0
+    for k in range(len(lo)):
+        for angle in (lo[k], hi[k]):
+            corners[count, 0] = x + length[k] * math.cos(angle + yaw)
+            corners[count, 1] = y + length[k] * math.sin(angle + yaw)
+            count += 1
+        following = lo[k + 1] if k + 1 < len(lo) else lo[0] + TWO_PI
+        if following - hi[k] > EDGE_RAD:
+            corners[count, 0], corners[count, 1] = x, y
+            count += 1
+    return corners[:count]
+
+
+@njit(cache=True, nogil=True)
 def free_reach(border: Any, edges: Any, width: float, polygon: Any, reach: float, range_max: float) -> Any:
     """How near the border of a star polygon comes to the origin within each sector, outside the vehicle's outline.
 

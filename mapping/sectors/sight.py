@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.kernels import sectors as kernels
 
 F64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 GAP_MAX_SPACINGS = 1.5
 TURN = 2.0 * math.pi
-_TOUCH_RAD = 1e-9
+_TOUCH_RAD = kernels.EDGE_RAD
 _SAME_PLACE_M = 1e-9
 _CONE_STEP_RAD = math.radians(2.0)
 _ARC_STEP_RAD = math.radians(0.5)
@@ -53,13 +54,9 @@ class Sight:
         """(M, 2) corners of the star, virtual sensor frame, closed, counter-clockwise; chords stand for its arcs."""
         if len(self.lo_rad) == 0:
             return np.empty((0, 2))
-        corners = np.zeros((len(self.lo_rad), 3, 2))
-        corners[:, 0, 0], corners[:, 0, 1] = self.length_m * np.cos(self.lo_rad), self.length_m * np.sin(self.lo_rad)
-        corners[:, 1, 0], corners[:, 1, 1] = self.length_m * np.cos(self.hi_rad), self.length_m * np.sin(self.hi_rad)
-        following = np.append(self.lo_rad[1:], self.lo_rad[0] + TURN)
-        joined = following - self.hi_rad <= _TOUCH_RAD
-        corners[joined, 2] = corners[joined, 1]  # elsewhere the border goes home to the sensor and out again
-        return np.ascontiguousarray(self.virtual_from_sensor.apply(corners.reshape(-1, 2)))
+        pose = self.virtual_from_sensor
+        border: F64 = kernels.star_border(self.lo_rad, self.hi_rad, self.length_m, pose.x_m, pose.y_m, pose.yaw_rad)
+        return border
 
     def contains(self, points: F64) -> Bool:
         """(N,) which (N, 2) points, virtual sensor frame, were seen to be free."""
