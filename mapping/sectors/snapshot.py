@@ -33,7 +33,8 @@ class PolarSnapshot:
     state: (N,) SectorState.  distance_m: (N,) from the virtual origin: to the nearest obstacle when OBSTACLE (and
     when STALE and last an obstacle), up to which the whole sector was seen free when FREE, else NaN.
     bearing_rad: (N,) of the nearest obstacle, NaN if none.  clearance_m: (N,) distance_m less the stretch inside the
-    vehicle's outline along that bearing (NaN where distance_m is).  age_ns: (N,) since the evidence that decided the state, -1 none.
+    vehicle's outline along that bearing, or its largest in a FREE sector (NaN where distance_m is).
+    age_ns: (N,) since the evidence that decided the state, -1 none.
     source: (N,) index into sources, -1 none.
     """
 

@@ -311,6 +311,20 @@ def test_an_obstacle_stays_until_somebody_looks_there_again() -> None:
     assert sectors.snapshot(LIMIT_NS + 20).state[sector] == FREE
 
 
+def test_an_obstacle_from_before_a_loss_stays_stale_after_it() -> None:
+    sectors = laser_map()
+    ranges, blind = nothing_seen(), nothing_seen()
+    post = np.argmin(np.abs(BEARING - math.radians(12.0)))
+    ranges[post], blind[post] = 1.0, np.nan
+    sweep(sectors, ranges)
+    sweep(sectors, blind, stamp_ns=1)
+    sectors.lost("laser")
+    sweep(sectors, blind, stamp_ns=2)
+    snapshot = sectors.snapshot(2)
+    assert snapshot.state[at(snapshot, 12.0)] == STALE
+    assert snapshot.state[at(snapshot, 40.0)] == FREE
+
+
 def test_an_echo_counts_for_every_sector_of_its_cone() -> None:
     sectors = laser_map(sources=("sonar",))
     ping(sectors, 1.5, axis_deg=2.0)  # from -13 to 17 degrees
