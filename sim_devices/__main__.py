@@ -38,7 +38,6 @@ TRUTH_PERIOD_NS = SECOND_NS // 20
 WATCH_PERIOD_NS = SECOND_NS // 20
 DEFAULT_SLIP_M = 0.0005
 HOST_NEEDS_NS = 3 * SECOND_NS  # for bringing up all devices, before the first metre
-QUICK_PACE = {"sweep_s": 0.010, "sample_s": 0.005}
 
 AnyScene = SimScene | LogScene
 
@@ -239,7 +238,7 @@ def _log_stage(options: argparse.Namespace, config: Table, now_ns: int) -> Stage
     if options.drive:
         raise Refused("--drive does not go with --log: a log has its own way")
     log = read_log(options.log, poses=PoseKind(options.poses) if options.poses else None)
-    pace = Pace(speed=options.speed, **(QUICK_PACE if options.speed > 1.0 else {}))
+    pace = Pace(speed=options.speed)
     track_width_m = float(config.get("drive", {}).get("track_width_m", 0.5))
     scene = LogScene(log, pace=pace, track_width_m=track_width_m, origin_ns=now_ns)
     config = for_log(

@@ -26,7 +26,7 @@ from sim_devices.robot import Piece, Trajectory, WheelErrors, Wheels, twist
 F64 = NDArray[np.float64]
 
 HURRY_M_S = 3.0  # of a wheel, on the way from scan to scan
-WIDEST_MARGIN_S = 0.06
+WIDEST_MARGIN_S = 0.08
 TOLERANCE_M = {PoseKind.CORRECTED: 0.001, PoseKind.ODOMETRY: 0.005}
 LARGEST_STEP_ERROR_RAD = 1e-4
 
@@ -44,13 +44,16 @@ class Pace:
 
     @property
     def margin_s(self) -> float:
-        """Between a stand's ends and the sweeps in it: odometry sampled on both sides of them is then at rest."""
-        return 1.5 * self.sample_s
+        """Between a stand's ends and the sweeps in it: wheels asked on both sides of a sweep are then at rest.
+
+        Faster than real time there is no other slack: some questions may be late or lost on a busy machine.
+        """
+        return (4.0 if self.speed > 1.0 else 1.5) * self.sample_s
 
     @property
     def rest_s(self) -> float:
-        """Pause between turning and driving, so that no sample of the wheels mixes both."""
-        return 2.5 * self.sample_s
+        """Pause between turning and driving, so that no two samples in a row have both between them."""
+        return 4.0 * self.sample_s
 
     @property
     def shortest_stand_s(self) -> float:
