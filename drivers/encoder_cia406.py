@@ -134,6 +134,7 @@ class _Node:
         self._sdo = SdoClient(node)
         self.sync_pdo_id = 0x280 + node
         self.cyclic_pdo_id = 0x180 + node
+        self.missing = False  # it was asked and did not answer
         self.identity = Identity()
         self.unwrapper = Unwrapper(max_turns_per_s)
         self.begin(0, cyclic=False)
@@ -163,7 +164,7 @@ class _Node:
     def trouble(self) -> str | None:
         if self.refusal is not None:
             return f"{self.name}: {self.refusal}"
-        if not self.answered:
+        if self.missing:
             return f"{self.name} does not answer: check its power, the wiring and termination, node id and bit rate"
         if self.emergency is not None:
             return f"{self.name} reports error {self.emergency:04X}h: see its manual for this emergency code"
@@ -201,6 +202,7 @@ class _Node:
         if self.phase is _Phase.STARTED and self._beats and now_ns - self._heard_ns > self._life_ns:
             self._counters.drop("node_lost")
             self.begin(now_ns, cyclic=self.cyclic)
+            self.missing = True
 
     # ---- in
 
@@ -261,10 +263,12 @@ class _Node:
         """An SDO transfer has ended: the next step of the set-up."""
         if done.abort_code == TIMED_OUT:
             self.begin(max(now_ns, self._search_due_ns), cyclic=self.cyclic)
+            self.missing = True
             return
         if self._script is None:
             return
         self.answered = True
+        self.missing = False
         if not done.ok:
             self._counters.drop("sdo_abort")
         try:
@@ -531,6 +535,7 @@ class Cia406PairConversation:
     def _begin_nodes(self, now_ns: int) -> None:
         for node in self._nodes:
             node.begin(now_ns, cyclic=self._cyclic)
+            node.missing = False
         self._tracks = [_Track(), _Track()]
         self._listen()
         self._pause()

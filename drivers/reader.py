@@ -484,7 +484,8 @@ class _Source(Generic[WireT]):
             self._since_ns = now_ns
         self._told, self._told_ns = news, now_ns
         self._sink(self.name, DeviceEvent(now_ns, state, text, news[2]))
-        level = logging.INFO if state in (LinkState.STARTING, LinkState.RUNNING) else logging.WARNING
+        good = state in (LinkState.STARTING, LinkState.RUNNING) or text == _WORDS[LinkState.SILENT]
+        level = logging.INFO if good else logging.WARNING
         self._log.say(now_ns, f"{self.name}: {state.name}", level, f"{self.name}: {state.name.lower()}: {text}")
 
 

@@ -51,6 +51,7 @@ Mode = Literal["auto", "request", "listen"]
 """auto: listens if the board sends often enough by itself, else asks. request: asks. listen: never asks for data."""
 
 _CONNECT_PERIOD_NS = 250_000_000
+_ANSWER_PATIENCE_NS = 500_000_000  # then it is told that nobody answers
 _PARAMETERS_PERIOD_NS = 400_000_000
 _PARAMETERS_TRIES = 3  # then it is measured without them
 _PARAMETERS_LATER_NS = 5_000_000_000
@@ -69,6 +70,8 @@ _NEVER = 1 << 62
 class _Progress:
     """What is forgotten whenever the wire is opened."""
 
+    connected_ns: int = 0
+    overdue: bool = False  # it should have answered by now
     answered: bool = False
     heard_ns: int = 0
     running: bool = False
@@ -136,7 +139,7 @@ class _Board:
     def trouble(self) -> str | None:
         now = self._now
         if not now.answered:
-            return self._silent_hint
+            return self._silent_hint if now.overdue else None
         if now.silent_groups:
             names = ", ".join(f"{4 * group + 1} to {4 * group + 4}" for group in sorted(now.silent_groups))
             return f"no more values of channels {names}: does the board send all groups?"
@@ -160,7 +163,7 @@ class _Board:
         return max(limit_ns, period_ns * 3 // 2)  # only when told to listen to a board that speaks less often
 
     def connected(self, now_ns: int) -> None:
-        self._now = _Progress(connect_due_ns=now_ns)
+        self._now = _Progress(connected_ns=now_ns, connect_due_ns=now_ns)
 
     # ---- out
 
@@ -170,6 +173,7 @@ class _Board:
         self._watch_sending(now_ns)
         now = self._now
         if not now.answered:
+            now.overdue = now_ns - now.connected_ns > _ANSWER_PATIENCE_NS
             if now_ns < now.connect_due_ns:
                 return []
             now.connect_due_ns = now_ns + _CONNECT_PERIOD_NS
