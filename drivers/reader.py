@@ -5,7 +5,7 @@ One thread per wire; several conversations may share a CAN wire, each then sees 
     port cannot be opened or is lost   ABSENT at once; tried again after 0.1 s, later up to 1 s, for ever
     no reading within silence_limit    SILENT at once, while it goes on asking; after 0.4 s more it starts from reset,
                                        then again after up to 1 s each
-    set-up takes for ever              the conversation starts from reset after 10 s
+    set-up takes for ever              the conversation starts from reset after 20 s
     an exception in a conversation     a bug: logged with its traceback, counted, that conversation alone restarts
 
 `step` does one turn of the loop and may be called without a thread: tests own clock and port.
@@ -34,7 +34,7 @@ _FIRST_BACKOFF_NS = 100_000_000
 _LONGEST_BACKOFF_NS = 1_000_000_000
 _SILENCE_PATIENCE_NS = 400_000_000  # a device that only paused keeps its set-up, and wheels their count
 _OWN_PAUSE_NS = 30_000_000  # so much later than it should be, the loop itself was held up
-_SETUP_LIMIT_NS = 10_000_000_000
+_SETUP_LIMIT_NS = 20_000_000_000  # spin-up and the search for a line speed included
 _EVENT_PERIOD_NS = 1_000_000_000  # between two events that tell the same state in other words
 _LOG_PERIOD_NS = 60_000_000_000
 _SHORTEST_WAIT_S = 0.0005
