@@ -41,7 +41,7 @@ F64 = NDArray[np.float64]
 SECOND = 1_000_000_000
 TICK_PERIOD_NS = 25_000_000  # how often tick() is to be called
 _FOREVER_NS = 1 << 62
-_AHEAD_LIMIT_NS = SECOND  # stamps farther in the future are nonsense
+_AHEAD_LIMIT_NS = 100_000_000  # a stamp farther in the future is nonsense; taken, it would make the next ones old
 _BEAMS_MAX = 100_000
 _SECTOR_PERIOD_NS = 50_000_000  # a sector map is published so often even if nothing feeds it
 _SECTOR_GAP_NS = 20_000_000  # sonars that follow each other faster are published together, with the next tick
@@ -259,9 +259,12 @@ class Fusion:
             return []
         outputs: list[Output] = [ScanOut(laser.name, scan, laser.base_from_sensor, laser.height_m)]
         sweep_ns = _last_beam_ns(scan) - scan.stamp_ns
-        self._fresh_until_ns[laser.name] = scan.stamp_ns + stale_after_ns(reading.scan_period_ns, sweep_ns)
+        self._fresh_until_ns[laser.name] = min(scan.stamp_ns, now_ns) + stale_after_ns(reading.scan_period_ns, sweep_ns)
         if fed := self._fed_by(laser.name):
             seen, base_from_sensor = self._as_seen_now(scan, laser.base_from_sensor)
+            seen = replace(
+                seen, stamp_ns=min(scan.stamp_ns, now_ns)
+            )  # ages count from the first beam, never from later
             for index in fed:
                 self._parts.sectors[index].take_scan(laser.name, seen, base_from_sensor)
                 outputs.append(self._tell(index, now_ns))
@@ -298,8 +301,7 @@ class Fusion:
             swept = deskew(scan, _HeldPoses(self._poses), base_from_sensor)
         except GoneError:
             return scan, base_from_sensor
-        seen = replace(swept.scan, stamp_ns=scan.stamp_ns)  # ages count from the first beam
-        return seen, self._state.odom_from_base.inverse() @ swept.odom_from_sensor
+        return swept.scan, self._state.odom_from_base.inverse() @ swept.odom_from_sensor
 
     # --- sonars
 
@@ -313,10 +315,11 @@ class Fusion:
         if not cones:
             return []
         heard = Round(reading.stamp_ns, cones, chain.cone_rad, chain.range_min_m, chain.range_max_m)
-        self._fresh_until_ns[chain.name] = reading.stamp_ns + memory.stale_after_ns
+        self._fresh_until_ns[chain.name] = min(reading.stamp_ns, now_ns) + memory.stale_after_ns
+        now_heard = replace(heard, stamp_ns=min(reading.stamp_ns, now_ns))
         outputs: list[Output] = [memory.output(reading.stamp_ns)]
         for index in self._fed_by(chain.name):
-            self._parts.sectors[index].take_round(chain.name, heard)
+            self._parts.sectors[index].take_round(chain.name, now_heard)
             if self._told_since_ns(index, now_ns) >= _SECTOR_GAP_NS:
                 outputs.append(self._tell(index, now_ns))
             else:
