@@ -82,7 +82,7 @@ def search(
     none reaches floor_share of the best's); scores are mean likelihoods in [0, 1].
     """
     turns = int(turn_rad / turn_step_rad)
-    blocks = int(math.ceil(window_m / (resolution_m * block)))
+    blocks = math.ceil(window_m / (resolution_m * block))
     side = 2 * blocks + 1
     total = (2 * turns + 1) * side * side
     bounds = np.empty(total, dtype=np.int64)

@@ -113,13 +113,11 @@ def optimise(poses: F64, edges: Edges, *, start_scale: float = FINAL_SCALE, most
     """
     x = np.array(poses, dtype=np.float64)
     scale = max(start_scale, FINAL_SCALE)
-    weight, distance = np.ones(len(edges)), np.zeros(len(edges))
     steps = 0
     if len(x) > 1 and len(edges):
         pattern = _Pattern(len(x), edges)
         while steps < most_steps:
-            distance = mahalanobis(x, edges)
-            weight = np.where(edges.doubtful, (scale / (scale + distance)) ** 2, 1.0)
+            weight = np.where(edges.doubtful, (scale / (scale + mahalanobis(x, edges))) ** 2, 1.0)
             step = pattern.solve(x, edges, weight)
             x -= step
             x[:, 2] = wrap_angles(x[:, 2])
@@ -127,9 +125,13 @@ def optimise(poses: F64, edges: Edges, *, start_scale: float = FINAL_SCALE, most
             if scale <= FINAL_SCALE and float(np.abs(step).max()) < SMALL_STEP:
                 break
             scale = max(FINAL_SCALE, SHRINK * scale)
-        distance = mahalanobis(x, edges)
-        weight = np.where(edges.doubtful, (FINAL_SCALE / (FINAL_SCALE + distance)) ** 2, 1.0)
-    return Solution(x, weight, distance, steps)
+    return Solution(x, weights_of(x, edges), mahalanobis(x, edges), steps)
+
+
+def weights_of(poses: F64, edges: Edges) -> F64:
+    """(E,) weights of edges as the poses stand."""
+    inside = FINAL_SCALE / (FINAL_SCALE + mahalanobis(poses, edges))
+    return np.where(edges.doubtful, inside**2, 1.0)
 
 
 def covariance_of(poses: F64, edges: Edges, weight: F64, key: int) -> F64:

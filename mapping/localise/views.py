@@ -109,6 +109,13 @@ class ViewArrays:
     quality: F32
     frames: F64
 
+    def view(self, row: int) -> View:
+        """A kept view again."""
+        first, width, bins, closed = (float(v) for v in self.frames[row])
+        table = BearingTable(first, width, int(bins), closed > 0.0)
+        x, y, nx, ny, quality = (a[row, : table.bins] for a in (self.x, self.y, self.nx, self.ny, self.quality))
+        return View(table, x, y, nx, ny, quality, int(np.sum(quality > EMPTY)), int(np.sum(quality > 0.0)))
+
 
 class ViewStore:
     """Views that are kept, in the order they came. Rows below `len` never change, so `arrays()` may go to a thread."""
@@ -142,11 +149,6 @@ class ViewStore:
         """What is kept so far; later views appear in later calls only."""
         x, y, nx, ny, quality = self._arrays
         return ViewArrays(self._count, x, y, nx, ny, quality, self._frames)
-
-    def view(self, row: int, table: BearingTable) -> View:
-        """A kept view again."""
-        x, y, nx, ny, quality = (a[row, : table.bins] for a in self._arrays)
-        return View(table, x, y, nx, ny, quality, int(np.sum(quality > EMPTY)), int(np.sum(quality > 0.0)))
 
     def _grow(self, rows: int, bins: int) -> None:
         """Into new arrays: what was handed out stays as it is."""

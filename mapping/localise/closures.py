@@ -1,0 +1,411 @@
+"""Closing loops: which key scans see a place again, how sure that is, and what the map looks like afterwards.
+
+All of it is one pure function of a snapshot (`Work.run`), so that a thread may do it while the robot drives on.
+
+1. Candidates: key scans from an earlier part of the way, nearer to the key in question than the drift that may have
+   gathered between them. Drift grows with the way through the graph, closures being shortcuts, so that after a loop
+   is closed the search is narrow again.
+2. Measurement: where the possible drift is small, the matcher starts from the present estimate ("tracked"); else a
+   correlative search finds the place ("searched") and the matcher refines it.
+3. Tests of a single closure: most of the scan's points lie on surfaces the others saw, next to none lies in space
+   they saw through; no second place fits nearly as well; the geometry holds the pose in every direction; the
+   correction is one that drift can explain.
+4. Probation: a searched closure counts only when others, found independently from other places of the way, ask for
+   the same correction. Tracked ones agree with the map already.
+5. Optimisation with weights that let a false closure fall out; a group that does not survive it is undone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.frames import Pose2
+from mapping.localise.pose_graph import (
+    Edges,
+    Solution,
+    covariance_of,
+    mahalanobis,
+    optimise,
+    weights_of,
+)
+from mapping.localise.scan_match import TRACKING, Match, Reach, agreement, match_view, weakest_information
+from mapping.localise.search import find_view, raster_of
+from mapping.localise.views import ViewArrays
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+REFINING = Reach((0.40, 0.28, 0.20, 0.15), (0.12, 0.08, 0.06, 0.04))
+
+
+@dataclass(frozen=True, slots=True)
+class ClosureSettings:
+    """What counts as seeing a place again. Lengths along the way are metres driven.
+
+    apart_m: the way between two visits.  drift_m, drift_share: how far off a key may be after a way through the graph:
+    the sum of both, at most search_m.  tracked_m: up to this drift no search is needed.  turn_rad_per_m: heading drift.
+    place_m: key scans on either side along the way that make up a place.  every_m: a place is searched for so often.
+    explained, refuted: shares of the points, see Agreement.  weakest_per_m2: least information in the worst direction.
+    agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way.
+    pending: how many closures wait at most.
+    """
+
+    apart_m: float = 8.0
+    drift_m: float = 0.6
+    drift_share: float = 0.05
+    search_m: float = 14.0
+    tracked_m: float = 1.0
+    turn_start_rad: float = math.radians(6.0)
+    turn_rad_per_m: float = math.radians(0.15)
+    turn_most_rad: float = math.radians(30.0)
+    place_m: float = 2.5
+    places: int = 3
+    every_m: float = 0.8
+    score: float = 0.55
+    rival: float = 0.93
+    explained: float = 0.55
+    overlap: float = 0.90
+    mean_cost: float = 0.35
+    weakest_per_m2: float = 400.0
+    agreeing: int = 3
+    agreeing_way_m: float = 1.2
+    pending: int = 64
+    floor_m: float = 0.015
+    floor_rad: float = math.radians(0.15)
+    misfit: float = 30.0
+    optimise_every: int = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """Key `to` seen from key `start`, an earlier one.
+
+    information: (3, 3) in the frame of start.  searched: found by search, not from the estimate.
+    number: its name, for undoing; -1 until it is accepted.
+    """
+
+    start: int
+    to: int
+    measured: Pose2
+    information: F64
+    explained: float
+    searched: bool
+    number: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """What a piece of work sees.
+
+    poses: (N, 3) of key scans in the map frame.  travel_m: (N,) way driven up to each.  path: edges between successive
+    key scans.  closures: accepted.  pending: on probation.  keys: those to look for closures of.  thorough: optimise
+    in any case, until nothing moves.
+    """
+
+    views: ViewArrays
+    poses: F64
+    travel_m: F64
+    path: Edges
+    closures: tuple[Closure, ...]
+    pending: tuple[Closure, ...]
+    keys: tuple[int, ...]
+    unoptimised: int
+    next_number: int
+    thorough: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WorkResult:
+    """What came of it. poses: (N, 3) of the snapshot's keys; closures: all that are accepted now, weight: (C,) of each.
+
+    covariance: (3, 3) of the last key's pose, first key exact.  events: how often what happened.
+    """
+
+    poses: F64
+    closures: tuple[Closure, ...]
+    weight: F64
+    pending: tuple[Closure, ...]
+    unoptimised: int
+    next_number: int
+    covariance: F64
+    events: dict[str, int]
+
+
+def edges_of(closures: tuple[Closure, ...] | list[Closure]) -> Edges:
+    """Closures as doubtful edges."""
+    if not closures:
+        return Edges.none()
+    return Edges(
+        np.array([c.start for c in closures], dtype=np.int64),
+        np.array([c.to for c in closures], dtype=np.int64),
+        np.array([(c.measured.x_m, c.measured.y_m, c.measured.yaw_rad) for c in closures]),
+        np.array([c.information for c in closures]),
+        np.ones(len(closures), dtype=np.bool_),
+    )
+
+
+@dataclass(slots=True)
+class Work:
+    """One piece of work for the back end; `run` changes nothing but what it returns."""
+
+    snapshot: Snapshot
+    settings: ClosureSettings
+    _events: Counter[str] = field(default_factory=Counter)
+
+    def run(self) -> WorkResult:
+        """Look for closures of the snapshot's keys, judge what is pending, optimise if it is worth it."""
+        self._events = Counter()
+        shot = self.snapshot
+        accepted, pending = list(shot.closures), list(shot.pending)
+        tracked, searched = self._look()
+        accepted += tracked
+        pending += searched
+        poses, weight = shot.poses, None
+        unoptimised = shot.unoptimised + len(tracked)
+        covariance: F64 | None = None
+        group, waiting = self._agreeing(pending)
+        if group:
+            trial = self._solve(poses, accepted + group, start_scale=1e4)
+            if float(np.median(trial.weight[len(shot.path) + len(accepted) :])) >= 0.25:
+                accepted, pending, poses, unoptimised = accepted + group, waiting, trial.poses, 0
+                self._events["accepted_after_probation"] += len(group)
+                weight = trial.weight
+            else:
+                pending = waiting
+                self._events["undone"] += len(group)
+        elif self._is_due(accepted, unoptimised):
+            solved = self._solve(poses, accepted)
+            poses, weight, unoptimised = solved.poses, solved.weight, 0
+        if weight is None:
+            weight = self._weights(poses, accepted)
+        edges = shot.path.joined(edges_of(accepted))
+        covariance = covariance_of(poses, edges, weight, len(poses) - 1)
+        numbered, number = _numbered(accepted, shot.next_number)
+        return WorkResult(
+            poses, numbered, weight[len(shot.path) :], self._kept(pending), unoptimised, number, covariance,
+            dict(self._events),
+        )  # fmt: skip
+
+    # --- looking
+
+    def _look(self) -> tuple[list[Closure], list[Closure]]:
+        """Closures of the snapshot's keys: tracked ones, and searched ones."""
+        tracked: list[Closure] = []
+        searched: list[Closure] = []
+        if not self.snapshot.keys:
+            return tracked, searched
+        way_m = self._ways(self.snapshot.keys)
+        last_search_m = -math.inf
+        for row, key in enumerate(self.snapshot.keys):
+            near, wide = self._places(key, way_m[row])
+            for place in near:
+                tracked += self._track(key, place)
+            if wide and self.snapshot.travel_m[key] - last_search_m >= self.settings.every_m:
+                last_search_m = float(self.snapshot.travel_m[key])
+                searched += self._search(key, wide, way_m[row])
+        return tracked, searched
+
+    def _ways(self, keys: tuple[int, ...]) -> F64:
+        """(K, N) length of the shortest way through the graph from each key to every other."""
+        from scipy.sparse import csr_matrix
+        from scipy.sparse.csgraph import dijkstra
+
+        shot = self.snapshot
+        edges = shot.path.joined(edges_of(shot.closures))
+        length = np.hypot(edges.measured[:, 0], edges.measured[:, 1]) + 1e-3
+        order = np.lexsort((length, edges.to, edges.start))  # of parallel edges the shortest
+        pair = edges.start[order] * len(shot.poses) + edges.to[order]
+        first = np.concatenate(([True], pair[1:] != pair[:-1]))
+        chosen = order[first]
+        graph = csr_matrix(
+            (length[chosen], (edges.start[chosen], edges.to[chosen])), shape=(len(shot.poses), len(shot.poses))
+        )
+        return np.asarray(dijkstra(graph, directed=False, indices=np.array(keys)))
+
+    def _places(self, key: int, way_m: F64) -> tuple[list[int], list[int]]:
+        """Keys at the middle of places to compare with: those near enough to track, and those to search."""
+        shot, s = self.snapshot, self.settings
+        earlier = np.flatnonzero(shot.travel_m[key] - shot.travel_m[: key + 1] > s.apart_m)
+        if not len(earlier):
+            return [], []
+        off = shot.poses[earlier] - shot.poses[key]
+        distance = np.hypot(off[:, 0], off[:, 1])
+        drift = np.minimum(s.search_m, s.drift_m + s.drift_share * way_m[earlier])
+        facing = distance + 1.0 - np.cos(off[:, 2])  # of places equally near, the one seen from the same side
+        trackable = (drift <= s.tracked_m) & (distance < 2.0)
+        near = self._spread(earlier[trackable], facing[trackable], s.place_m * 2.0, 2)
+        if near:
+            return near, []
+        wide = (drift > s.tracked_m) & (distance < drift + 2.0)
+        return [], self._spread(earlier[wide], (facing / drift)[wide], s.place_m * 2.0, s.places)
+
+    def _spread(self, keys: I64, cost: F64, apart_m: float, most: int) -> list[int]:
+        """The cheapest keys that lie apart along the way."""
+        travel = self.snapshot.travel_m
+        chosen: list[int] = []
+        for key in keys[np.argsort(cost, kind="stable")].tolist():
+            if all(abs(travel[key] - travel[other]) >= apart_m for other in chosen):
+                chosen.append(key)
+                if len(chosen) == most:
+                    break
+        return chosen
+
+    def _around(self, place: int, key: int, reach_m: float, most: int) -> I64:
+        """Keys within reach_m along the way of a place, evenly thinned to `most`; the place itself is one."""
+        travel = self.snapshot.travel_m
+        rows = np.flatnonzero(np.abs(travel[:key] - travel[place]) < reach_m)
+        rows = rows[travel[key] - travel[rows] > 0.5 * self.settings.apart_m]
+        if len(rows) > most:
+            rows = rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.int64))]
+        return np.union1d(rows, [place])
+
+    # --- measuring
+
+    def _track(self, key: int, place: int) -> list[Closure]:
+        shot = self.snapshot
+        rows = self._around(place, key, self.settings.place_m, 8)
+        here = Pose2(*shot.poses[key].tolist())
+        match = match_view(shot.views.view(key), shot.views, rows, shot.poses[rows], here, reach=TRACKING)
+        closure = self._judged(key, place, rows, match, here, self.settings.tracked_m, searched=False)
+        self._events["tracked"] += closure is not None
+        return [] if closure is None else [closure]
+
+    def _search(self, key: int, places: list[int], way_m: F64) -> list[Closure]:
+        """The one place of several that fits; none if two do and contradict each other."""
+        shot, s = self.snapshot, self.settings
+        view, here = shot.views.view(key), Pose2(*shot.poses[key].tolist())
+        found: list[tuple[Closure, float]] = []
+        self._events["searches"] += 1
+        for place in places:
+            drift = min(s.search_m, s.drift_m + s.drift_share * float(way_m[place]))
+            turn = min(s.turn_most_rad, s.turn_start_rad + s.turn_rad_per_m * float(way_m[place]))
+            rows = self._around(place, key, max(s.place_m, 0.5 * drift), 16)
+            spot = find_view(view, raster_of(shot.views, rows, shot.poses[rows]), here, window_m=drift, turn_rad=turn)
+            if spot is None or spot.score < s.score:
+                self._events["no_place_fits"] += 1
+                continue
+            if spot.rival > s.rival:
+                self._events["ambiguous"] += 1
+                continue
+            match = match_view(view, shot.views, rows, shot.poses[rows], spot.pose, reach=REFINING)
+            closure = self._judged(key, place, rows, match, spot.pose, 0.6, searched=True)
+            if closure is not None:
+                found.append((closure, spot.score))
+        if not found:
+            return []
+        best = max(found, key=lambda entry: entry[1])[0]
+        if any(not self._same_correction(best, other, strict=False) for other, _ in found):
+            self._events["contradicting_places"] += 1
+            return []
+        self._events["searched"] += 1
+        return [best]
+
+    def _judged(
+        self, key: int, place: int, rows: I64, match: Match | None, guess: Pose2, most_m: float, *, searched: bool
+    ) -> Closure | None:
+        """The closure that a match says, if it passes the tests of a single one."""
+        shot, s = self.snapshot, self.settings
+        if match is None:
+            self._events["no_match"] += 1
+            return None
+        off = guess.inverse() @ match.pose
+        if math.hypot(off.x_m, off.y_m) > most_m or abs(off.yaw_rad) > math.radians(8.0):
+            self._events["ran_away"] += 1
+            return None
+        agrees = agreement(shot.views.view(key), shot.views, rows, shot.poses[rows], match.pose)
+        if agrees.explained < s.explained or agrees.overlap < s.overlap or match.mean_cost > s.mean_cost:
+            self._events["does_not_fit"] += 1
+            return None
+        information = match.information()
+        if weakest_information(information) < s.weakest_per_m2:
+            self._events["degenerate"] += 1
+            return None
+        start = Pose2(*shot.poses[place].tolist())
+        seen = floored(turned_information(information, -start.yaw_rad), s.floor_m, s.floor_rad)
+        return Closure(place, key, start.inverse() @ match.pose, seen, agrees.explained, searched)
+
+    # --- probation
+
+    def _agreeing(self, pending: list[Closure]) -> tuple[list[Closure], list[Closure]]:
+        """The largest group of pending closures that ask for one correction, if it is enough, and the rest."""
+        s, travel = self.settings, self.snapshot.travel_m
+        best: list[int] = []
+        for first in pending:
+            group = [k for k, other in enumerate(pending) if self._same_correction(first, other)]
+            if len(group) > len(best):
+                best = group
+        keys = {pending[k].to for k in best}
+        if len(keys) < s.agreeing:
+            return [], pending
+        way = [float(travel[k]) for k in keys]
+        if max(way) - min(way) < s.agreeing_way_m:
+            return [], pending
+        chosen = set(best)
+        return [pending[k] for k in best], [c for k, c in enumerate(pending) if k not in chosen]
+
+    def _same_correction(self, a: Closure, b: Closure, *, strict: bool = True) -> bool:
+        """Whether two closures move the robot to the same place, drift between them allowed for."""
+        if a is b:
+            return True
+        poses, travel = self.snapshot.poses, self.snapshot.travel_m
+        way = abs(float(travel[a.to] - travel[b.to])) + abs(float(travel[a.start] - travel[b.start]))
+        if strict and way > 60.0:
+            return False
+        at = Pose2(*poses[a.to].tolist())
+        by_a = Pose2(*poses[a.start].tolist()) @ a.measured
+        by_b = Pose2(*poses[b.start].tolist()) @ b.measured @ (Pose2(*poses[b.to].tolist()).inverse() @ at)
+        off = by_a.inverse() @ by_b
+        return math.hypot(off.x_m, off.y_m) < 0.25 + 0.02 * way and abs(off.yaw_rad) < math.radians(2.0 + 0.1 * way)
+
+    def _kept(self, pending: list[Closure]) -> tuple[Closure, ...]:
+        """The newest, as many as may wait."""
+        self._events["probation_ended"] += max(0, len(pending) - self.settings.pending)
+        return tuple(pending[-self.settings.pending :])
+
+    # --- optimising
+
+    def _is_due(self, accepted: list[Closure], unoptimised: int) -> bool:
+        if not unoptimised:
+            return self.snapshot.thorough
+        if self.snapshot.thorough or unoptimised >= self.settings.optimise_every:
+            return True
+        newest = edges_of(accepted[-unoptimised:])
+        return float(np.median(mahalanobis(self.snapshot.poses, newest))) > self.settings.misfit
+
+    def _solve(self, poses: F64, closures: list[Closure], start_scale: float = 100.0) -> Solution:
+        edges = self.snapshot.path.joined(edges_of(closures))
+        self._events["optimised"] += 1
+        return optimise(poses, edges, start_scale=start_scale, most_steps=25 if self.snapshot.thorough else 12)
+
+    def _weights(self, poses: F64, closures: list[Closure]) -> F64:
+        return weights_of(poses, self.snapshot.path.joined(edges_of(closures)))
+
+
+def _numbered(closures: list[Closure], number: int) -> tuple[tuple[Closure, ...], int]:
+    """Closures with names; the next free name."""
+    out = []
+    for closure in closures:
+        if closure.number < 0:
+            closure = replace(closure, number=number)
+            number += 1
+        out.append(closure)
+    return tuple(out), number
+
+
+def turned_information(information: F64, yaw_rad: float) -> F64:
+    """An information matrix over (x, y, yaw) in a frame turned by yaw_rad against the one it is given in."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(turn @ information @ turn.T)
+
+
+def floored(information: F64, floor_m: float, floor_rad: float) -> F64:
+    """An information matrix after errors of floor_m and floor_rad that no matcher sees were added."""
+    covariance = np.linalg.inv(information + 1e-6 * np.eye(3)) + np.diag([floor_m**2, floor_m**2, floor_rad**2])
+    inverse = np.linalg.inv(covariance)
+    return np.asarray(0.5 * (inverse + inverse.T))

@@ -1,0 +1,499 @@
+"""Simultaneous localisation and mapping with lasers: a pose for every scan, a map that is consistent as a whole.
+
+Front end: each sweep is laid on the last key scans (scan_match), starting from odometry or, without it, from the
+motion so far. Every key_m or key_rad a sweep is kept as a key scan. Back end: loops between key scans, and the pose
+graph (closures, pose_graph), cut into pieces of work.
+
+Whose thread does what: none of ours. `add_scan` is called in order of stamps. After it `take_work` may hand out a
+piece of work, whose `run` may be called anywhere, also in another thread. Its result is applied at a moment that only
+the stamps of the scans decide: `is_due(stamp)` says so before a scan is added. So a trajectory does not depend on
+how fast anything ran, and a replay or an offline run gives the same bytes.
+
+    if slam.is_due(scan.stamp_ns):
+        slam.apply(pending.result())          # of a thread pool, or simply work.run() of before
+    update = slam.add_scan(scan, base_from_sensor, odom_from_base)
+    work = slam.take_work()
+    if work is not None:
+        pending = pool.submit(work.run)
+
+The lag is settings.lag_s plus lag_s_per_key for each key scan of the graph, about ten times what the work takes on
+one core of a small machine. If the worker is later than that, whoever calls waits before it adds the next scan, or
+holds scans back and goes on with odometry and the last correction: both give the same trajectory in the end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.frames import IDENTITY, Pose2, compose_covariance
+from mapping.localise.closures import (
+    Closure,
+    ClosureSettings,
+    Snapshot,
+    Work,
+    WorkResult,
+    floored,
+    turned_information,
+)
+from mapping.localise.pose_graph import Edges, composed_poses
+from mapping.localise.scan_match import Match, agreement, match_view
+from mapping.localise.search import find_view, raster_of
+from mapping.localise.views import BearingTable, View, ViewStore, table_for, view_of
+from mapping.scan import Scan
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class SlamSettings:
+    """Defaults for every robot and building.
+
+    key_m, key_rad: a key scan so often.  references: how many key scans a sweep is laid on, the newest within near_m.
+    farthest_m: longer readings are not matched.  odometry_*: standard deviation of a step by odometry: a constant, a
+    share of the way and of the turn.  work_keys: new key scans that make a piece of work.  lag_s, lag_s_per_key: see
+    the module's text.
+    """
+
+    key_m: float = 0.3
+    key_rad: float = math.radians(12.0)
+    references: int = 12
+    near_m: float = 6.0
+    farthest_m: float = 30.0
+    odometry_m: float = 0.01
+    odometry_share: float = 0.10
+    odometry_m_per_rad: float = 0.05
+    odometry_rad: float = math.radians(0.5)
+    odometry_turn_share: float = 0.15
+    odometry_rad_per_m: float = math.radians(1.0)
+    floor_m: float = 0.008
+    floor_rad: float = math.radians(0.1)
+    least_points: int = 12
+    work_keys: int = 10
+    lag_s: float = 1.0
+    lag_s_per_key: float = 0.002
+    closures: ClosureSettings = field(default_factory=ClosureSettings)
+
+
+@dataclass(frozen=True, slots=True)
+class SlamUpdate:
+    """Where the robot was at one scan.
+
+    covariance: (3, 3) of map_from_base, the start of the map taken as exact.  matched: False where the scan fitted
+    nothing and the pose is a prediction.  key: the key scan it is tied to; is_key: this scan is a new one.
+    epoch: counts corrections of the map: poses of other epochs do not mix.
+    """
+
+    stamp_ns: int
+    map_from_base: Pose2
+    covariance: F64
+    matched: bool
+    key: int
+    is_key: bool
+    epoch: int
+
+
+class WorkIsDueError(RuntimeError):
+    """A scan was added before the result that is due had been applied."""
+
+
+@dataclass(slots=True)
+class _Sensor:
+    """What is known of one laser."""
+
+    table: BearingTable
+    last_key: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A predicted pose of the sensor in the map and its information (3, 3)."""
+
+    map_from_sensor: Pose2
+    information: F64
+
+
+class Slam:
+    """See the module's text. Lasers are told apart by the name given with their scans."""
+
+    def __init__(self, settings: SlamSettings | None = None, *, start: Pose2 | None = None) -> None:
+        self.settings = settings if settings is not None else SlamSettings()
+        self.epoch = 0
+        self.events: Counter[str] = Counter()
+        self.closures: tuple[Closure, ...] = ()
+        self.closure_weight: F64 = np.zeros(0)
+        self._start = start
+        self._sensors: dict[str, _Sensor] = {}
+        self._views = ViewStore()
+        self._poses: F64 = np.zeros((64, 3))  # map_from_sensor of key scans
+        self._travel: F64 = np.zeros(64)
+        self._base_from_sensor: list[Pose2] = []
+        self._key_stamps: list[int] = []
+        self._path: list[tuple[Pose2, F64]] = []  # measured, information: key k to k + 1
+        self._pending: tuple[Closure, ...] = ()
+        self._stamps: list[int] = []
+        self._scan_key: list[int] = []
+        self._scan_in_key: list[tuple[float, float, float]] = []  # base pose in the key scan's sensor frame
+        self._last: tuple[int, Pose2, Pose2 | None] | None = None  # stamp, map_from_base, odom_from_base
+        self._velocity: F64 = np.zeros(3)
+        self._lost_scans = 0
+        self._key_odom: Pose2 | None = None  # of the sensor, at the newest key scan
+        self._key_covariance: F64 = np.zeros((3, 3))
+        self._looked_at = 0
+        self._outstanding: Work | None = None
+        self._due_ns = 0
+        self._unoptimised = 0
+        self._next_number = 0
+        self._handed_out = False
+
+    # --- scans
+
+    def add_scan(
+        self, scan: Scan, base_from_sensor: Pose2 = IDENTITY, odom_from_base: Pose2 | None = None, *, sensor: str = ""
+    ) -> SlamUpdate:
+        """Find where the robot was at scan.stamp_ns; scans in order of stamps, de-skewed, in their sensor's frame.
+
+        odom_from_base: odometry at that time; None where there is none.
+        Raises WorkIsDueError if `is_due(scan.stamp_ns)` and the result was not applied.
+        """
+        if self.is_due(scan.stamp_ns):
+            raise WorkIsDueError("apply the result of the work that was taken before adding this scan")
+        view = self._view(scan, sensor)
+        guess = self._predicted(scan.stamp_ns, base_from_sensor, odom_from_base)
+        if view is None:
+            return self._told_only(scan.stamp_ns, guess.map_from_sensor @ base_from_sensor.inverse(), odom_from_base)
+        if not len(self._views):
+            self._keep(scan.stamp_ns, sensor, view, guess.map_from_sensor, base_from_sensor, odom_from_base, None)
+            return self._told(scan.stamp_ns, guess.map_from_sensor, base_from_sensor, odom_from_base, None, True)
+        match = self._matched(view, guess)
+        pose = guess.map_from_sensor if match is None else match.pose
+        is_key = self._is_new_ground(sensor, pose)
+        if is_key:
+            self._keep(scan.stamp_ns, sensor, view, pose, base_from_sensor, odom_from_base, match)
+        return self._told(scan.stamp_ns, pose, base_from_sensor, odom_from_base, match, is_key)
+
+    def _view(self, scan: Scan, sensor: str) -> View | None:
+        """The sweep in its sensor's table; None if there is too little in it."""
+        known = self._sensors.get(sensor)
+        if known is None:
+            try:
+                known = _Sensor(table_for(scan.bearing_rad))
+            except ValueError:
+                self.events["scan_without_beams"] += 1
+                return None
+            self._sensors[sensor] = known
+        view = view_of(scan, known.table, farthest_m=self.settings.farthest_m)
+        if view.points < self.settings.least_points:
+            self.events["scan_too_empty"] += 1
+            return None
+        return view
+
+    def _predicted(self, stamp_ns: int, base_from_sensor: Pose2, odom_from_base: Pose2 | None) -> _Place:
+        """Where the sensor should be: by odometry since the last scan, else by the motion so far."""
+        s = self.settings
+        if self._last is None:
+            start = self._start or odom_from_base or IDENTITY
+            return _Place(start @ base_from_sensor, np.zeros((3, 3)))
+        last_ns, last_pose, last_odom = self._last
+        if odom_from_base is not None and last_odom is not None:
+            step = last_odom.inverse() @ odom_from_base
+            way, turn = math.hypot(step.x_m, step.y_m), abs(step.yaw_rad)
+            sigma_m = s.odometry_m + s.odometry_share * way + s.odometry_m_per_rad * turn
+            sigma_rad = s.odometry_rad + s.odometry_turn_share * turn + s.odometry_rad_per_m * way
+        else:
+            seconds = min(max((stamp_ns - last_ns) * 1e-9, 0.0), 0.5)
+            vx, vy, w = (float(v) for v in self._velocity * seconds)
+            step = Pose2(vx, vy, w)
+            sigma_m = 0.05 + 2.0 * seconds**2 + 0.3 * math.hypot(vx, vy)
+            sigma_rad = math.radians(3.0) + 3.0 * seconds**2 + 0.3 * abs(w)
+        information = np.diag([1.0 / sigma_m**2, 1.0 / sigma_m**2, 1.0 / sigma_rad**2])
+        return _Place(last_pose @ step @ base_from_sensor, information)
+
+    def _references(self, near: Pose2) -> I64:
+        """The newest key scans that are not far away."""
+        n = len(self._views)
+        rows = np.arange(max(0, n - self.settings.references), n)
+        distance = np.hypot(self._poses[rows, 0] - near.x_m, self._poses[rows, 1] - near.y_m)
+        close = rows[distance < self.settings.near_m]
+        return close if len(close) else rows[-1:]
+
+    def _matched(self, view: View, guess: _Place) -> Match | None:
+        """The view laid on the references; where that fails, after looking around; None if nothing fits."""
+        rows = self._references(guess.map_from_sensor)
+        store, poses = self._views.arrays(), self._poses[rows]
+        match = match_view(view, store, rows, poses, guess.map_from_sensor, prior=guess.information)
+        if match is not None and match.share > 0.25 and match.mean_cost < 0.45:
+            self._lost_scans = 0
+            return match
+        self.events["looked_around"] += 1
+        fits = 0.0 if match is None else agreement(view, store, rows, poses, match.pose).explained
+        window_m = min(3.0, 0.6 + 0.2 * self._lost_scans)
+        found = find_view(
+            view, raster_of(store, rows, poses), guess.map_from_sensor, window_m=window_m, turn_rad=math.radians(25.0)
+        )
+        if found is not None:
+            other = match_view(view, store, rows, poses, found.pose)
+            if other is not None:
+                other_fits = agreement(view, store, rows, poses, other.pose).explained
+                if other_fits > fits + 0.1:
+                    match, fits = other, other_fits
+        if match is None or fits < 0.3:
+            self.events["not_matched"] += 1
+            self._lost_scans += 1
+            return None
+        self._lost_scans = 0
+        return match
+
+    def _is_new_ground(self, sensor: str, pose: Pose2) -> bool:
+        last = self._sensors[sensor].last_key
+        if last < 0:
+            return True
+        off = self._key_pose(last).inverse() @ pose
+        return math.hypot(off.x_m, off.y_m) > self.settings.key_m or abs(off.yaw_rad) > self.settings.key_rad
+
+    def _key_pose(self, key: int) -> Pose2:
+        x, y, yaw = self._poses[key].tolist()
+        return Pose2(x, y, yaw)
+
+    def _keep(
+        self, stamp_ns: int, sensor: str, view: View, pose: Pose2, base_from_sensor: Pose2, odom: Pose2 | None,
+        match: Match | None,
+    ) -> None:  # fmt: skip
+        """Make this scan a key scan."""
+        key = self._views.add(view)
+        if key == len(self._poses):
+            self._poses = np.concatenate((self._poses, np.zeros_like(self._poses)))
+            self._travel = np.concatenate((self._travel, np.zeros_like(self._travel)))
+        self._poses[key] = (pose.x_m, pose.y_m, pose.yaw_rad)
+        self._sensors[sensor].last_key = key
+        self._base_from_sensor.append(base_from_sensor)
+        self._key_stamps.append(stamp_ns)
+        odom_from_sensor = None if odom is None else odom @ base_from_sensor
+        if key > 0:
+            before = self._key_pose(key - 1)
+            measured = before.inverse() @ pose
+            information = self._path_information(before, measured, match, odom_from_sensor)
+            self._path.append((measured, information))
+            self._travel[key] = self._travel[key - 1] + math.hypot(measured.x_m, measured.y_m)
+            self._key_covariance = compose_covariance(
+                before, self._key_covariance, measured, np.linalg.inv(information)
+            )
+        self._key_odom = odom_from_sensor
+
+    def _path_information(self, before: Pose2, measured: Pose2, match: Match | None, odom: Pose2 | None) -> F64:
+        """Of a key scan's pose seen from the one before: what the match holds, and what odometry holds."""
+        s = self.settings
+        way, turn = math.hypot(measured.x_m, measured.y_m), abs(measured.yaw_rad)
+        has_odometry = odom is not None and self._key_odom is not None
+        share, constant = (s.odometry_share, s.odometry_m) if has_odometry else (0.5, 0.10)
+        sigma_m = constant + share * way + s.odometry_m_per_rad * turn
+        sigma_rad = (s.odometry_rad if has_odometry else math.radians(5.0)) + s.odometry_turn_share * turn
+        information = np.diag([1.0 / sigma_m**2, 1.0 / sigma_m**2, 1.0 / sigma_rad**2])
+        if match is not None:
+            information = information + turned_information(match.information(), -before.yaw_rad)
+        return floored(information, s.floor_m, s.floor_rad)
+
+    def _told_only(self, stamp_ns: int, map_from_base: Pose2, odom: Pose2 | None) -> SlamUpdate:
+        """A scan that nothing can be done with: the prediction stands for it."""
+        if not len(self._views):
+            self._last = (stamp_ns, map_from_base, odom)
+            return SlamUpdate(stamp_ns, map_from_base, np.zeros((3, 3)), False, -1, False, self.epoch)
+        key = len(self._views) - 1
+        sensor = map_from_base @ self._base_from_sensor[key]
+        return self._told(stamp_ns, sensor, self._base_from_sensor[key], odom, None, False)
+
+    def _told(
+        self, stamp_ns: int, map_from_sensor: Pose2, base_from_sensor: Pose2, odom: Pose2 | None, match: Match | None,
+        is_key: bool,
+    ) -> SlamUpdate:  # fmt: skip
+        """Note where a scan was, and say it."""
+        key = len(self._views) - 1
+        map_from_base = map_from_sensor @ base_from_sensor.inverse()
+        if self._last is not None:
+            self._note_velocity(stamp_ns, map_from_base)
+        self._last = (stamp_ns, map_from_base, odom)
+        key_pose = self._key_pose(key)
+        in_key = key_pose.inverse() @ map_from_base
+        self._stamps.append(stamp_ns)
+        self._scan_key.append(key)
+        self._scan_in_key.append((in_key.x_m, in_key.y_m, in_key.yaw_rad))
+        covariance = self._key_covariance
+        if not is_key and match is not None:
+            held = floored(turned_information(match.information(), -key_pose.yaw_rad), 0.005, math.radians(0.1))
+            covariance = compose_covariance(key_pose, covariance, in_key, np.linalg.inv(held))
+        elif match is None and key > 0:
+            covariance = covariance + np.diag([0.05**2, 0.05**2, math.radians(3.0) ** 2]) * (1 + self._lost_scans)
+        return SlamUpdate(stamp_ns, map_from_base, covariance, match is not None or key == 0, key, is_key, self.epoch)
+
+    def _note_velocity(self, stamp_ns: int, map_from_base: Pose2) -> None:
+        """Keep the motion of the base a second, in its own frame, for scans without odometry."""
+        assert self._last is not None
+        seconds = (stamp_ns - self._last[0]) * 1e-9
+        if not 0.0 < seconds < 1.0:
+            self._velocity = np.zeros(3)
+            return
+        step = self._last[1].inverse() @ map_from_base
+        self._velocity = np.array([step.x_m, step.y_m, step.yaw_rad]) / seconds
+
+    # --- the back end
+
+    def take_work(self) -> Work | None:
+        """The piece of work that became ready with the last scan, once; None if there is none."""
+        n = len(self._views)
+        if self._outstanding is None and n - self._looked_at >= self.settings.work_keys:
+            self._outstanding = Work(self._snapshot(tuple(range(self._looked_at, n))), self.settings.closures)
+            self._looked_at = n
+            lag_s = self.settings.lag_s + self.settings.lag_s_per_key * n
+            self._due_ns = self._stamps[-1] + round(lag_s * 1e9)
+            self._handed_out = False
+        if self._outstanding is None or self._handed_out:
+            return None
+        self._handed_out = True
+        return self._outstanding
+
+    def is_due(self, stamp_ns: int) -> bool:
+        """Whether the result of the work that was taken must be applied before a scan of this stamp is added."""
+        return self._outstanding is not None and stamp_ns >= self._due_ns
+
+    def apply(self, result: WorkResult) -> None:
+        """Take the result of the work that was handed out; later key scans move along with the last it knew."""
+        if self._outstanding is None:
+            raise RuntimeError("no work was taken")
+        known, n = len(result.poses), len(self._views)
+        assert known == len(self._outstanding.snapshot.poses)
+        before = self._key_pose(known - 1)
+        after = Pose2(*result.poses[-1].tolist())
+        moved = float(np.abs(result.poses[:, :2] - self._poses[:known, :2]).max(initial=0.0))
+        if moved > 0.0:
+            tail = self._poses[known:n].copy()
+            correction = after @ before.inverse()
+            self._poses[:known] = result.poses
+            self._poses[known:n] = composed_poses(_row(correction), tail)
+            if self._last is not None:
+                stamp, pose, odom = self._last
+                self._last = (stamp, correction @ pose, odom)
+        if moved > 0.01:
+            self.epoch += 1
+        self._pending, self.closures, self.closure_weight = result.pending, result.closures, result.weight
+        self._unoptimised, self._next_number = result.unoptimised, result.next_number
+        self._key_covariance = self._grown(result.covariance, known - 1)
+        self.events.update(result.events)
+        self._outstanding = None
+
+    def _grown(self, covariance: F64, key: int) -> F64:
+        """Covariance of the newest key scan from that of an earlier one, along the path."""
+        for k in range(key, len(self._views) - 1):
+            measured, information = self._path[k]
+            covariance = compose_covariance(self._key_pose(k), covariance, measured, np.linalg.inv(information))
+        return covariance
+
+    def _snapshot(self, keys: tuple[int, ...], *, thorough: bool = False) -> Snapshot:
+        n = len(self._views)
+        return Snapshot(
+            self._views.arrays(), self._poses[:n].copy(), self._travel[:n].copy(), self._path_edges(), self.closures,
+            self._pending, keys, self._unoptimised, self._next_number, thorough,
+        )  # fmt: skip
+
+    def _path_edges(self) -> Edges:
+        n = len(self._path)
+        return Edges(
+            np.arange(n),
+            np.arange(1, n + 1),
+            np.array([(z.x_m, z.y_m, z.yaw_rad) for z, _ in self._path]).reshape(-1, 3),
+            np.array([w for _, w in self._path]).reshape(-1, 3, 3),
+            np.zeros(n, dtype=np.bool_),
+        )
+
+    def finish(self, progress: Progress | None = None) -> None:
+        """No scan will follow: do what work is left, here, then look again at every key scan and optimise until
+        nothing moves. May be called in the midst of a run; scans may follow."""
+        if self._outstanding is not None:
+            self.apply(self._outstanding.run())
+        n = len(self._views)
+        while self._looked_at < n:
+            keys = tuple(range(self._looked_at, min(n, self._looked_at + 50)))
+            self._looked_at = keys[-1] + 1
+            self._do(self._snapshot(keys))
+        self._do(self._snapshot((), thorough=True))
+        for first in range(0, n, 100):
+            closed = {c.to for c in self.closures}
+            keys = tuple(k for k in range(first, min(n, first + 100)) if k not in closed)
+            self._do(self._snapshot(keys))
+            if progress is not None:
+                progress(min(n, first + 100), n)
+        self._do(self._snapshot((), thorough=True))
+
+    def _do(self, snapshot: Snapshot) -> None:
+        self._outstanding = Work(snapshot, self.settings.closures)
+        self.apply(self._outstanding.run())
+
+    def add_closure(self, start: int, to: int, measured: Pose2, information: F64) -> int:
+        """A closure from elsewhere: key scan `to` seen from `start` (sensor frames). It is as doubtful as any and
+        counts from the next optimisation on. Returns its number."""
+        if not 0 <= start < len(self._views) or not 0 <= to < len(self._views) or start == to:
+            raise ValueError(f"no such pair of key scans: {start}, {to}; there are {len(self._views)}")
+        if self._outstanding is not None:
+            raise WorkIsDueError("apply the result of the work that was taken first")
+        number = self._next_number
+        closure = Closure(start, to, measured, np.asarray(information, dtype=np.float64), 1.0, True, number)
+        self.closures = (*self.closures, closure)
+        self.closure_weight = np.append(self.closure_weight, 1.0)
+        self._next_number += 1
+        self._unoptimised += 1
+        return number
+
+    def undo_closure(self, number: int) -> None:
+        """Forget one closure; the map settles at the next optimisation. KeyError if there is none of that number."""
+        if self._outstanding is not None:
+            raise WorkIsDueError("apply the result of the work that was taken first")
+        kept = [k for k, c in enumerate(self.closures) if c.number != number]
+        if len(kept) == len(self.closures):
+            raise KeyError(number)
+        self.closures = tuple(self.closures[k] for k in kept)
+        self.closure_weight = self.closure_weight[kept]
+        self._unoptimised += 1
+
+    # --- what is known
+
+    @property
+    def keys(self) -> int:
+        """Number of key scans."""
+        return len(self._views)
+
+    @property
+    def memory_bytes(self) -> int:
+        """What views take; the rest is small."""
+        return self._views.memory_bytes
+
+    def trajectory(self) -> tuple[I64, F64]:
+        """Stamps (N,) and base poses (N, 3) of all scans, as the map stands now."""
+        if not self._stamps:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        keys = np.array(self._scan_key)
+        poses = composed_poses(self._poses[keys], np.array(self._scan_in_key))
+        return np.array(self._stamps, dtype=np.int64), poses
+
+    def key_poses(self) -> F64:
+        """(K, 3) base poses of key scans."""
+        mounts = np.array([_row(p.inverse()) for p in self._base_from_sensor]).reshape(-1, 3)
+        return composed_poses(self._poses[: len(self._views)], mounts)
+
+
+def run_here(slam: Slam, stamp_ns: int, result: WorkResult | None) -> WorkResult | None:
+    """For one thread: apply the result that is due before a scan of this stamp; what is left to apply."""
+    if slam.is_due(stamp_ns):
+        assert result is not None
+        slam.apply(result)
+        return None
+    return result
+
+
+def _row(pose: Pose2) -> F64:
+    return np.array([pose.x_m, pose.y_m, pose.yaw_rad])
