@@ -35,7 +35,7 @@ from service.fusion import SECTOR_MEMORY_NS, Fusion, GridLayer, Localiser, Odome
 from service.sensors import Chain, Laser, Sensor, Transducer, Wheels
 
 if TYPE_CHECKING:
-    from service.layers import BuildingLayer
+    from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +199,7 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
     """Empty maps as configured, fed by the sensors found."""
     from mapping.grids.occupancy import OccupancyGrid
     from mapping.grids.rolling import RollingGrid
-    from service.layers import BuildingLayer, RollingLayer
+    from service.layers import BuildingLayer, PolarLayer, RollingLayer
 
     building = None
     grids: list[GridLayer] = []
@@ -221,10 +221,23 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
                 period_ns=round(local.period_s * 1e9),
             )
         )
-    return Maps(tuple(_sector_maps(config)), tuple(grids), building)
+    sectors = tuple(_sector_maps(config))
+    if config.artos.enabled:
+        grids.append(_artos_map(config, [layer for layer in sectors if isinstance(layer, PolarLayer)]))
+    return Maps(sectors, tuple(grids), building)
 
 
-def _sector_maps(config: Config) -> Iterator[SectorLayer]:
+def _artos_map(config: Config, polar: Sequence[PolarLayer]) -> ArtosLayer:
+    from mapping.sectors.artos import ArtosMap
+    from service.layers import ArtosLayer
+
+    artos = config.artos
+    wanted = [layer for layer in polar if not artos.sources or layer.name in artos.sources]
+    grid = ArtosMap(resolution_m=artos.resolution_m, size_m=artos.size_m)
+    return ArtosLayer(grid, wanted, period_ns=round(artos.period_s * 1e9))
+
+
+def _sector_maps(config: Config) -> Iterator[PolarLayer | RectLayer]:
     from mapping.sectors.polar import PolarSectors
     from mapping.sectors.rectangular import RectSectors
     from service.layers import PolarLayer, RectLayer

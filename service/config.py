@@ -461,14 +461,6 @@ class Log(Section):
     )
 
 
-class Recording(Section):
-    """Raw bytes and everything published, as MCAP."""
-
-    enabled: bool = Field(default=False, description="Record from the first byte.")
-    directory: str = Field(default="~/.local/share/umfeld/recordings", description="Where recordings go.")
-    max_mb: Positive = Field(default=1024.0, description="A recording ends here.")
-
-
 class Config(Section):
     """umfeld.toml as a whole."""
 
@@ -487,7 +479,6 @@ class Config(Section):
     ros: Ros = Field(default=Ros(), description="ROS 2 beside our own keys.")
     store: Store = Field(default=Store(), description="The map on disk.")
     log: Log = Field(default=Log(), description="What is written to standard error.")
-    recording: Recording = Field(default=Recording(), description="Raw bytes and everything published.")
 
     def devices(self) -> Iterator[tuple[str, str, Device]]:
         """(section, name, device) of every device, in a fixed order."""

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from mapping.sectors.rectangular import RectSectors
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
@@ -16,7 +15,9 @@ from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
 from mapping.grids.rolling import RollingGrid
 from mapping.scan import Scan
+from mapping.sectors.artos import ArtosMap
 from mapping.sectors.polar import PolarSectors
+from mapping.sectors.rectangular import RectSectors
 from service.fusion import SECOND, Round
 from service.outputs import GridOut, GridUpdateOut, Output, PolarOut, RectOut
 
@@ -223,3 +224,31 @@ class RollingLayer:
         self._told_ns, self._changed = now_ns, False
         self._epoch += 1
         return [GridOut(stamp_ns, self._epoch, self.grid.patch(), name=self.name)]
+
+
+class ArtosLayer:
+    """The two-step map, drawn from polar sector maps as they stand: it is fed by maps, not by sensors."""
+
+    sources: frozenset[str] = frozenset()
+
+    def __init__(self, grid: ArtosMap, maps: Iterable[PolarLayer], *, period_ns: int) -> None:
+        self.grid = grid
+        self._maps = tuple(maps)
+        self._period_ns = period_ns
+        self._drawn_ns: int | None = None
+        self._epoch = 0
+
+    def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
+        raise AssertionError("the two-step map is drawn from sector maps")
+
+    def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
+        raise AssertionError("the two-step map is drawn from sector maps")
+
+    def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
+        due = self._drawn_ns is None or now_ns - self._drawn_ns >= self._period_ns
+        if map_from_base is None or not due:
+            return []
+        self._drawn_ns = now_ns
+        self._epoch += 1
+        self.grid.update([each.sectors.snapshot(now_ns) for each in self._maps], map_from_base)
+        return [GridOut(now_ns, self._epoch, self.grid.patch(), name="artos")]

@@ -55,6 +55,9 @@ sources = ["front", "sonars.front", "rear"]
 sources = ["side"]
 [local_grid]
 enabled = true
+[artos]
+enabled = true
+sources = ["all"]
 [grid]
 sources = ["front"]
 """
@@ -110,7 +113,7 @@ def test_maps_are_fed_by_what_the_configuration_says(config: Config) -> None:
     sensors = assemble.sensors(config)
     maps = assemble.maps(config, sensors)
     assert [layer.sources for layer in maps.sectors] == [{"front", "sonars-front", "rear"}, {"side"}]
-    assert [layer.sources for layer in maps.grids] == [{"front"}, {"front", "rear", "sonars-front", "side"}]
+    assert [layer.sources for layer in maps.grids] == [{"front"}, {"front", "rear", "sonars-front", "side"}, set()]
     assert maps.building is maps.grids[0]
     parts = assemble.parts(config, sensors, maps, OdometryOnly())
     assert parts.drive is not None
@@ -122,7 +125,7 @@ def test_nothing_is_kept_that_is_switched_off(config: Config) -> None:
     off = config.model_copy(update={"grid": config.grid.model_copy(update={"enabled": False})})
     maps = assemble.maps(off, assemble.sensors(off))
     assert maps.building is None
-    assert len(maps.grids) == 1
+    assert len(maps.grids) == 2
 
 
 def test_the_whole_robot_draws_and_tells(config: Config) -> None:
@@ -155,6 +158,10 @@ def test_the_whole_robot_draws_and_tells(config: Config) -> None:
     assert patch.cells[row - 10, column] <= 10
     assert any(isinstance(each, RectOut) for each in fusion.tick(2300 * ms))
     assert any(isinstance(each, GridOut) and each.name == "local" for each in outputs)
+    artos = next(each.patch for each in outputs if isinstance(each, GridOut) and each.name == "artos")
+    nearest = polar.snapshot.distance_m[ahead]
+    assert artos.cells[-artos.row0, int(nearest / 0.1) - artos.col0] > 50
+    assert artos.cells[-artos.row0, int(nearest / 0.2) - artos.col0] < 50
 
 
 def test_warming_up_leaves_no_trace_and_reaches_every_map(config: Config) -> None:

@@ -1,0 +1,53 @@
+"""Ports of this machine, from folders made like the system's."""
+
+from __future__ import annotations
+
+import os
+import pty
+from pathlib import Path
+
+import pytest
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+
+from service.device_list import can_interfaces, permission_trouble, serial_ports
+
+
+def test_a_port_is_shown_by_the_name_that_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = pty.openpty()
+    device = os.ttyname(slave)
+    (tmp_path / "usb-Hokuyo_URG").symlink_to(device)
+    info = ListPortInfo(device)
+    info.manufacturer, info.product, info.serial_number = "Hokuyo", "URG", None
+    monkeypatch.setattr(list_ports, "comports", lambda: [info])
+    (port,) = serial_ports(tmp_path)
+    os.close(master)
+    os.close(slave)
+    assert (port.name, port.stable_name, port.description) == (device, str(tmp_path / "usb-Hokuyo_URG"), "Hokuyo URG")
+    assert port.trouble == ""
+    assert serial_ports(tmp_path / "none")[0].stable_name == ""
+
+
+def test_can_interfaces_and_whether_they_are_up(tmp_path: Path) -> None:
+    for name, kind, state, flags in (
+        ("can0", "280", "up", "0x40081"),
+        ("can1", "280", "down", "0x40080"),
+        ("eth0", "1", "up", "0x1003"),
+    ):
+        (tmp_path / name).mkdir()
+        for file, text in (("type", kind), ("operstate", state), ("flags", flags)):
+            (tmp_path / name / file).write_text(text + "\n")
+    (tmp_path / "bonding_masters").write_text("")
+    assert [(each.name, each.trouble) for each in can_interfaces(tmp_path)] == [
+        ("can0", ""),
+        ("can1", "it is down; sudo ip link set can1 up type can bitrate 1000000"),
+    ]
+    assert can_interfaces(tmp_path / "none") == []
+
+
+def test_a_port_that_may_not_be_opened_names_the_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = tmp_path / "tty"
+    port.write_text("")
+    assert permission_trouble(port) == ""
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert "sudo usermod -aG" in permission_trouble(port)
