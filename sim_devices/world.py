@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -94,6 +95,8 @@ class Walker:
         speed = plan.speed_m_s * random.uniform(0.85, 1.15)
         self._knots_s, self._points, self._way_m = _timetable(points, legs, speed, plan.pause_s)
         self._round_s = float(self._knots_s[-1])
+        self._knots: list[float] = self._knots_s.tolist()
+        self._corners: list[Point] = [(float(x), float(y)) for x, y in self._points]
         self._offset_s = random.uniform(0.0, self._round_s)
 
     def place(self, stamp_s: F64) -> tuple[F64, F64, F64]:
@@ -106,6 +109,15 @@ class Walker:
         position = self._points[k] + part[:, None] * step
         way = self._way_m[k] + part * (self._way_m[k + 1] - self._way_m[k])
         return position, np.arctan2(step[:, 1], step[:, 0]), way
+
+    def place_now(self, time_s: float) -> Point:
+        """The position at one moment; as `place`, without arrays."""
+        t = (time_s + self._offset_s) % self._round_s
+        k = min(max(bisect_right(self._knots, t) - 1, 0), len(self._knots) - 2)
+        span = self._knots[k + 1] - self._knots[k]
+        part = (t - self._knots[k]) / span if span > 0.0 else 0.0
+        (ax, ay), (bx, by) = self._corners[k], self._corners[k + 1]
+        return (ax + part * (bx - ax), ay + part * (by - ay))
 
     def legs(self, stamp_s: F64) -> tuple[F64, F64]:
         """Centres (N, 2) of the left and the right leg."""
@@ -179,6 +191,8 @@ class World:
         here = np.asarray(origin, dtype=np.float64)
         segments = segments.only(np.hypot(*_nearest_points(segments.a - here, segments.b - here).T) <= range_max_m)
         centers, radii = self._round_things(circles, stamp_s, z_m)
+        in_reach = np.hypot(*(centers - here).T) <= range_max_m + radii
+        centers, radii = centers[in_reach], radii[in_reach]
         points = np.concatenate(
             (
                 _echo_points(segments, here, heading_rad, half_angle_rad),
@@ -202,8 +216,7 @@ class World:
         if not self.walkers or z_m > PERSON_HEIGHT_M:
             return circles.center, circles.radius_m
         if self._bodies is None or self._bodies[0] != stamp_s:
-            now = np.array([stamp_s])
-            self._bodies = (stamp_s, np.concatenate([w.place(now)[0] for w in self.walkers]))
+            self._bodies = (stamp_s, np.array([w.place_now(stamp_s) for w in self.walkers]))
         bodies = self._bodies[1]
         radii = np.append(circles.radius_m, np.full(len(bodies), BODY_RADIUS_M))
         return np.concatenate((circles.center, bodies)), radii
@@ -383,6 +396,8 @@ def _clipped_to_cone(a: F64, b: F64, half_angle_rad: float) -> tuple[F64, F64]:
 
 def _circle_points(centers: F64, radii: F64, here: F64, heading_rad: float, half_angle_rad: float) -> F64:
     """(E, 2) nearest points of circles that reach into the cone from outside."""
+    if not len(centers):
+        return np.zeros((0, 2))
     to_center = centers - here
     away = np.hypot(*to_center.T)
     bearing = np.arctan2(to_center[:, 1], to_center[:, 0])

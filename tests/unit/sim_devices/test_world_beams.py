@@ -122,6 +122,7 @@ def test_people_walk_are_seen_by_their_legs_and_never_jump() -> None:
     assert np.hypot(*np.diff(place, axis=0).T).max() <= 0.0116  # 1.15 m/s at most
     assert place[:, 1].max() == pytest.approx(1.0, abs=0.02)
     assert place[:, 1].min() == pytest.approx(-1.0, abs=0.02)
+    np.testing.assert_allclose([walker.place_now(float(t)) for t in times[::7]], place[::7], atol=1e-12)
     left, right = walker.legs(times)
     gap = np.hypot(*(left - right).T)
     assert gap.min() >= 0.2
