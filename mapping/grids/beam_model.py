@@ -23,6 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mapping.kernels import grids as kernels
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -138,14 +139,27 @@ class Fan:
     hit_m: F64
 
 
-def fan_of_beams(beams: Beams, origin_m: F64, spread_m: float, fill_gap_m: float) -> Fan | None:
-    """Beams with nearly the same origin, drawn from origin_m; None if none proves anything.
+def fan_of_beams(beams: Beams, origin_m: F64, spread_m: float, fill_gap_m: float) -> Fan:
+    """Beams with nearly the same origin, drawn from origin_m; at least one proves something, and all are finite.
 
     spread_m: how far origins are from origin_m: free lengths without a hit at their end are cut by it.
     """
+    n = beams.free.size
+    dir_x, dir_y, gap, free_m, hit_m = np.empty((5, n))
+    adjacent = np.zeros(n, dtype=np.bool_)
+    count = kernels.fan_of_lines(
+        float(origin_m[0]), float(origin_m[1]), spread_m, beams.end_m, beams.free, beams.hit, dir_x, dir_y, gap,
+        adjacent, free_m, hit_m,
+    )  # fmt: skip
+    if count == 0:
+        return _sorted_fan(beams, origin_m, spread_m, fill_gap_m)
+    wedge = _wedges_between(gap[:count], adjacent[:count], fill_gap_m)
+    return Fan(dir_x[:count], dir_y[:count], wedge, free_m[:count], hit_m[:count])
+
+
+def _sorted_fan(beams: Beams, origin_m: F64, spread_m: float, fill_gap_m: float) -> Fan:
+    """fan_of_beams for beams in any order; neighbours are those measured one after the other."""
     some = np.flatnonzero(beams.free | beams.hit)
-    if some.size == 0:
-        return None
     way = beams.end_m[some] - origin_m
     length = np.hypot(way[:, 0], way[:, 1])
     direction = np.where(length[:, None] > 0.0, way / np.maximum(length, 1e-300)[:, None], [1.0, 0.0])
@@ -155,22 +169,22 @@ def fan_of_beams(beams: Beams, origin_m: F64, spread_m: float, fill_gap_m: float
     gap = np.append(np.diff(turned[order]), 2.0 * np.pi - turned[order[-1]])
     steps = np.abs(np.diff(some[order], append=some[order[:1]]))
     adjacent = (steps == 1) | (steps == beams.free.size - 1)
-    wedge = _wedges_of(gap, adjacent, fill_gap_m)
     hit, free = beams.hit[some], beams.free[some]
     free_m = np.where(free, np.where(hit, length, np.maximum(length - spread_m, 0.0)), -1.0)
     return Fan(
         dir_x=np.ascontiguousarray(direction[order, 0]),
         dir_y=np.ascontiguousarray(direction[order, 1]),
-        wedge_m=wedge,
+        wedge_m=_wedges_between(gap, adjacent, fill_gap_m),
         free_m=free_m[order],
         hit_m=np.where(hit, length, -1.0)[order],
     )
 
 
-def _wedges_of(gap_rad: F64, adjacent: Bools, fill_gap_m: float) -> F64:
+def _wedges_between(gap_rad: F64, adjacent: Bools, fill_gap_m: float) -> F64:
     """As _wedges, where beams are neighbours only if they also were measured one after the other."""
-    if not np.any(adjacent):
+    between = np.sort(gap_rad[adjacent])
+    if between.size == 0:
         return np.zeros(gap_rad.size)
-    nominal = float(np.median(gap_rad[adjacent]))
+    nominal = float(between[between.size // 2])
     neighbours = adjacent & (gap_rad <= min(NEIGHBOUR_FACTOR * nominal, MAX_WEDGE_RAD))
     return np.where(neighbours, fill_gap_m / np.maximum(gap_rad, 1e-9), 0.0)

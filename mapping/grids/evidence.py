@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.frames import Pose2
-from mapping.grids.beam_model import Beams, BeamTable, beam_table, fan_of_beams
+from mapping.grids.beam_model import Beams, BeamTable, Fan, beam_table, fan_of_beams
 from mapping.grids.geometry import cell_of, cells_of, check_resolution
 from mapping.grids.patch import GridPatch
 from mapping.grids.sonar_model import SonarMemory, SonarRules, cone_of_reading, guard_rows
@@ -82,28 +82,37 @@ class _Work:
         self.beams(2048)
         self.rows = np.zeros(4096, dtype=np.int64)
         self.crossings(1 << 14)
-        self.lists(1 << 14)
+        self.saved(1 << 14)
 
     def beams(self, n: int) -> None:
-        self.free_len, self.hit_len = np.zeros(n), np.zeros(n)
-        self.ray_x, self.ray_y = np.zeros(n), np.zeros(n)
+        self.free_len, self.hit_len, self.ray_x, self.ray_y = np.zeros((4, n))
+        self.from_x, self.from_y, self.to_x, self.to_y = np.zeros((4, n))
+        self.todo_row, self.todo_col = np.zeros((2, n), dtype=np.int64)
 
     def crossings(self, n: int) -> None:
         self.cross_row, self.cross_col = np.zeros(n, dtype=np.int32), np.zeros(n, dtype=np.int32)
         self.sorted_col = np.zeros(n, dtype=np.int32)
 
-    def lists(self, n: int) -> None:
-        self.todo_row, self.todo_col = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+    def saved(self, n: int) -> None:
         self.saved_at, self.saved_value = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.uint16)
         self.saved_kind = np.zeros(n, dtype=np.uint8)
 
+    def list_cells(self, cells: I64) -> None:
+        """Hand (N, 2) cells to a kernel."""
+        n = len(cells)
+        if n > self.todo_row.size:
+            self.beams(2 * n)
+        if n > self.saved_at.size:
+            self.saved(2 * n)
+        self.todo_row[:n], self.todo_col[:n] = cells[:, 0], cells[:, 1]
+
     def grow(self) -> None:
         """Bring the room that the last kernel asked for."""
-        crossings, listed, rows = (int(k) for k in self.needed)
+        crossings, saved, rows = (int(k) for k in self.needed)
         if crossings > self.cross_row.size:
             self.crossings(2 * crossings)
-        if listed > self.saved_at.size:
-            self.lists(2 * listed)
+        if saved > self.saved_at.size:
+            self.saved(2 * saved)
         if rows > self.rows.size:
             self.rows = np.zeros(2 * rows, dtype=np.int64)
 
@@ -197,72 +206,68 @@ class EvidenceGrid:
         while not kernels.insert_scan(
             ox, oy, math.cos(map_from_sensor.yaw_rad), math.sin(map_from_sensor.yaw_rad), ranges,
             1.0 / self.resolution_m, float(range_min_m), float(range_max_m), self._use_max_m, bool(clear_no_return),
-            table.dir_x, table.dir_y, wedge, w.free_len, w.hit_len, w.ray_x, w.ray_y, w.cross_row, w.cross_col,
-            w.sorted_col, w.rows, w.todo_row, w.todo_col, w.saved_at, w.saved_value, w.saved_kind, w.needed, window,
+            table.dir_x, table.dir_y, wedge, w.free_len, w.hit_len, w.ray_x, w.ray_y, w.from_x, w.from_y, w.to_x,
+            w.to_y, w.cross_row, w.cross_col, w.sorted_col, w.rows, w.todo_row, w.todo_col, w.saved_at,
+            w.saved_value, w.saved_kind, w.needed, window,
             pool.tile_row0, pool.tile_col0, pool.cells, pool.index, pool.tile_at, pool.free_slots, pool.flags,
             pool.state, self._model_number, self._rule,
         ):  # fmt: skip
             w.grow()
 
-    def insert_beams(self, beams: Beams, *, spacing_hint_m: float | None = None) -> None:
+    def insert_beams(self, beams: Beams) -> None:
         """One sweep whose sensor moved (de-skewed): see Beams, and beams_of_scan which makes them.
 
         While all origins lie within half a cell of the middle one, wedges are filled as if all beams came from there
         (an error of at most half a cell, at the sensor's end); otherwise each beam frees the cells of its own line.
-        spacing_hint_m: fill wedges whose beams are this close at their ends, instead of the grid's fill_gap_m.
-        Raises ValueError for shapes that differ or a finite beam too long for the grid.
+        Raises ValueError for shapes that differ, or for beams that are not finite or too long for the grid.
         """
         n = beams.origin_m.shape[0]
         if not (beams.origin_m.shape == beams.end_m.shape == (n, 2) and beams.free.shape == beams.hit.shape == (n,)):
             raise ValueError("beams have (N, 2) origins and ends, (N,) free and hit")
-        some = beams.free | beams.hit
-        if not np.any(some):
+        beams = Beams(
+            np.ascontiguousarray(beams.origin_m),
+            np.ascontiguousarray(beams.end_m),
+            np.ascontiguousarray(beams.free),
+            np.ascontiguousarray(beams.hit),
+        )
+        measures = np.zeros(4)
+        if not kernels.measure_lines(beams.origin_m, beams.end_m, beams.free | beams.hit, measures):
             return
-        origin, end = beams.origin_m[some], beams.end_m[some]
-        if not (np.all(np.isfinite(origin)) and np.all(np.isfinite(end))):
+        middle, spread_m, length_m = measures[:2], float(measures[2]), float(measures[3])
+        if not math.isfinite(spread_m + length_m):
             raise ValueError("a beam that is free or hit has finite ends")
-        length_m = float(np.max(np.hypot(*(end - origin).T)))
         self._checked_reach(length_m)
-        middle = origin[len(origin) // 2]
-        spread_m = float(np.max(np.hypot(*(origin - middle).T)))
-        reach = (length_m + spread_m) / self.resolution_m
-        if spread_m < self.resolution_m / 2.0:
-            gap_m = self._fill_gap_m if spacing_hint_m is None else spacing_hint_m
-            self._insert_fan(beams, middle, spread_m, gap_m, reach)
-        else:
-            self._insert_lines(beams, middle, reach)
-
-    def _insert_fan(self, beams: Beams, middle: F64, spread_m: float, gap_m: float, reach: float) -> None:
-        fan = fan_of_beams(beams, middle, spread_m, gap_m)
-        if fan is None:
-            return
-        d = self.resolution_m
         ox, oy = self._checked_place(Pose2(float(middle[0]), float(middle[1])))
-        window = self._window_around(ox, oy, reach)
+        window = self._window_around(ox, oy, (length_m + spread_m) / self.resolution_m)
         if window is None:
             return
+        if spread_m < self.resolution_m / 2.0:
+            fan = fan_of_beams(beams, middle, spread_m, self._fill_gap_m)
+            self._insert_fan(fan, ox, oy, window)
+        else:
+            self._insert_lines(beams, window)
+
+    def _insert_fan(self, fan: Fan, ox: float, oy: float, window: I64) -> None:
+        d = self.resolution_m
         w, pool = self._beam_work(fan.free_m.size), self._pool
         free_len, hit_len, wedge = fan.free_m / d, fan.hit_m / d, fan.wedge_m / d
         while not kernels.insert_fan(
-            ox, oy, 1.0, 0.0, fan.dir_x, fan.dir_y, wedge, free_len, hit_len, w.ray_x, w.ray_y, w.cross_row,
-            w.cross_col, w.sorted_col, w.rows, w.todo_row, w.todo_col, w.saved_at, w.saved_value, w.saved_kind,
-            w.needed, window, pool.tile_row0, pool.tile_col0, pool.cells, pool.index, pool.tile_at, pool.free_slots,
-            pool.flags, pool.state, self._model_number, self._rule,
+            ox, oy, 1.0, 0.0, fan.dir_x, fan.dir_y, wedge, free_len, hit_len, w.ray_x, w.ray_y, w.from_x, w.from_y,
+            w.to_x, w.to_y, w.cross_row, w.cross_col, w.sorted_col, w.rows, w.todo_row, w.todo_col, w.saved_at,
+            w.saved_value, w.saved_kind, w.needed, window, pool.tile_row0, pool.tile_col0, pool.cells, pool.index,
+            pool.tile_at, pool.free_slots, pool.flags, pool.state, self._model_number, self._rule,
         ):  # fmt: skip
             w.grow()
 
-    def _insert_lines(self, beams: Beams, middle: F64, reach: float) -> None:
+    def _insert_lines(self, beams: Beams, window: I64) -> None:
         d = self.resolution_m
-        ox, oy = self._checked_place(Pose2(float(middle[0]), float(middle[1])))
-        window = self._window_around(ox, oy, reach)
-        if window is None:
-            return
-        some = beams.free | beams.hit
-        start, end = beams.origin_m[some] / d, beams.end_m[some] / d
+        start, end = beams.origin_m[beams.free].T / d, beams.end_m[beams.free].T / d
+        hit = cells_of(beams.end_m[beams.hit], d)
         w, pool = self._work, self._pool
+        w.list_cells(hit)
         while not kernels.insert_lines(
-            np.ascontiguousarray(start[:, 0]), np.ascontiguousarray(start[:, 1]), np.ascontiguousarray(end[:, 0]),
-            np.ascontiguousarray(end[:, 1]), beams.free[some], beams.hit[some], w.todo_row, w.todo_col, w.saved_at,
+            start.shape[1], np.ascontiguousarray(start[0]), np.ascontiguousarray(start[1]),
+            np.ascontiguousarray(end[0]), np.ascontiguousarray(end[1]), len(hit), w.todo_row, w.todo_col, w.saved_at,
             w.saved_value, w.saved_kind, w.needed, window, pool.tile_row0, pool.tile_col0, pool.cells, pool.index,
             pool.tile_at, pool.free_slots, pool.flags, pool.state, self._model_number, self._rule,
         ):  # fmt: skip
@@ -284,9 +289,7 @@ class EvidenceGrid:
         if window is None:
             return
         w, pool = self._work, self._pool
-        if len(cells) > w.saved_at.size:
-            w.lists(2 * len(cells))
-        w.todo_row[: len(cells)], w.todo_col[: len(cells)] = cells[:, 0], cells[:, 1]
+        w.list_cells(cells)
         kernels.insert_listed(
             len(cells), len(hit), w.todo_row, w.todo_col, w.saved_at, w.saved_value, w.saved_kind, window,
             pool.tile_row0, pool.tile_col0, pool.cells, pool.index, pool.tile_at, pool.free_slots, pool.flags,

@@ -14,7 +14,8 @@ Coordinates of kernels are in cells: x / resolution, so that cell (row, col) is 
 Two models share the pool: COUNTERS keeps hits << 8 | misses (0: never observed), LOG_ODDS keeps ODDS_ZERO + value.
 A cell that this scan has already dealt with holds MARK until the scan ends; its old content waits in `saved_*`.
 
-Run the tests also with NUMBA_BOUNDSCHECK=1 and with NUMBA_DISABLE_JIT=1.
+Run the tests also with NUMBA_BOUNDSCHECK=1 (and a NUMBA_CACHE_DIR of its own: the cache does not tell the two apart)
+and with NUMBA_DISABLE_JIT=1.
 """
 
 from __future__ import annotations
@@ -142,38 +143,59 @@ def line_length(x0: float, y0: float, x1: float, y1: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def list_line(x0: float, y0: float, x1: float, y1: float, count: int, todo_row: Any, todo_col: Any) -> int:
-    """List every cell a line passes, the same ones in both directions [AW87]; returns the new length of the list.
+def mark_lines(
+    lines: int, from_x: Any, from_y: Any, to_x: Any, to_y: Any, saved: int, saved_at: Any, saved_value: Any,
+    saved_kind: Any, window: Any, tile_row0: int, tile_col0: int, cells: Any, index: Any, tile_at: Any,
+    free_slots: Any, flags: Any, state: Any,
+) -> int:  # fmt: skip
+    """Put aside as missed, once each, the cells that lines pass, the same ones in both directions [AW87].
 
-    The walk takes exactly as many steps as there are borders between the two end cells, so rounding can at worst swap
-    two steps at a cell's corner; it cannot run past the end.
+    A walk takes exactly as many steps as there are borders between its two end cells, so rounding can at worst swap
+    two steps at a cell's corner; it cannot run past the end. Returns how many cells are put aside in all.
     """
-    if x1 < x0 or (x1 == x0 and y1 < y0):
-        x0, y0, x1, y1 = x1, y1, x0, y0
-    col, row = math.floor(x0), math.floor(y0)
-    cols_left = math.floor(x1) - col
-    row_step = 1 if y1 >= y0 else -1
-    rows_left = abs(math.floor(y1) - row)
-    per_col = 1.0 / (x1 - x0) if cols_left > 0 else 0.0
-    per_row = 1.0 / abs(y1 - y0) if rows_left > 0 else 0.0
-    to_col = (col + 1 - x0) * per_col
-    to_row = (row + 1 - y0 if row_step > 0 else y0 - row) * per_row
-    todo_row[count] = row
-    todo_col[count] = col
-    count += 1
-    while cols_left + rows_left > 0:
-        if rows_left == 0 or (cols_left > 0 and to_col < to_row):
-            col += 1
-            cols_left -= 1
-            to_col += per_col
-        else:
-            row += row_step
-            rows_left -= 1
-            to_row += per_row
-        todo_row[count] = row
-        todo_col[count] = col
-        count += 1
-    return count
+    row_lo, row_hi, col_lo, col_hi = window[0], window[1], window[2], window[3]
+    for k in range(lines):
+        x0, y0, x1, y1 = from_x[k], from_y[k], to_x[k], to_y[k]
+        if x1 < x0 or (x1 == x0 and y1 < y0):
+            x0, y0, x1, y1 = x1, y1, x0, y0
+        col, row = math.floor(x0), math.floor(y0)
+        cols_left = math.floor(x1) - col
+        row_step = 1 if y1 >= y0 else -1
+        rows_left = abs(math.floor(y1) - row)
+        per_col = 1.0 / (x1 - x0) if cols_left > 0 else 0.0
+        per_row = 1.0 / abs(y1 - y0) if rows_left > 0 else 0.0
+        to_col = (col + 1 - x0) * per_col
+        to_row = (row + 1 - y0 if row_step > 0 else y0 - row) * per_row
+        in_row, in_col = 0, 0  # the tile of the last cell
+        slot: Any = np.int64(0)  # none
+        while True:
+            if row_lo <= row < row_hi and col_lo <= col < col_hi:
+                if slot == 0 or row >> TILE_BITS != in_row or col >> TILE_BITS != in_col:
+                    in_row, in_col = row >> TILE_BITS, col >> TILE_BITS
+                    table_row, table_col = in_row - tile_row0, in_col - tile_col0
+                    slot = np.int64(index[table_row, table_col])
+                    if slot == 0:
+                        slot = new_slot(table_row, table_col, tile_row0, tile_col0, index, tile_at, free_slots, state)
+                    flags[slot] = 0xFF
+                at = (slot << (2 * TILE_BITS)) + ((row & TILE_MASK) << TILE_BITS) + (col & TILE_MASK)
+                value = cells[at]
+                if value != MARK:
+                    saved_at[saved] = at
+                    saved_value[saved] = value
+                    saved_kind[saved] = SAVED_MISS
+                    saved += 1
+                    cells[at] = MARK
+            if cols_left + rows_left == 0:
+                break
+            if rows_left == 0 or (cols_left > 0 and to_col < to_row):
+                col += 1
+                cols_left -= 1
+                to_col += per_col
+            else:
+                row += row_step
+                rows_left -= 1
+                to_row += per_row
+    return saved
 
 
 @njit(cache=True, nogil=True)
@@ -231,7 +253,7 @@ def fill_spans(
                 slot: Any = np.int64(index[table_row, table_col])
                 if slot == 0:
                     slot = new_slot(table_row, table_col, tile_row0, tile_col0, index, tile_at, free_slots, state)
-                # Unsigned: a test for negative indices would keep the loops from becoming vector code (10 times slower).
+                # Unsigned: a test for negative indices would keep these loops from becoming vector code.
                 first = np.uint64((slot << (2 * TILE_BITS)) + in_tile + (col & TILE_MASK))
                 last = first + np.uint64(tile_stop - col)
                 if model == COUNTERS:
@@ -252,7 +274,8 @@ def fill_spans(
 @njit(cache=True, nogil=True)
 def insert_fan(
     ox: float, oy: float, cos_yaw: float, sin_yaw: float, dir_x: Any, dir_y: Any, wedge: Any, free_len: Any,
-    hit_len: Any, ray_x: Any, ray_y: Any, cross_row: Any, cross_col: Any, sorted_col: Any, row_start: Any,
+    hit_len: Any, ray_x: Any, ray_y: Any, from_x: Any, from_y: Any, to_x: Any, to_y: Any,
+    cross_row: Any, cross_col: Any, sorted_col: Any, row_start: Any,
     todo_row: Any, todo_col: Any, saved_at: Any, saved_value: Any, saved_kind: Any, needed: Any,
     window: Any, tile_row0: int, tile_col0: int, cells: Any, index: Any, tile_at: Any, free_slots: Any, flags: Any,
     state: Any, model: int, rule: Any,
@@ -283,7 +306,8 @@ def insert_fan(
     # before to the reach of the wedge after; a wedge that does not exist has reach 0, so its sides lead to the sensor.
     room = cross_row.size
     found = 0
-    to_list = n
+    lines = 0
+    to_save = n
     before = first - 1 if first > 0 else n - 1
     inner = max(0.0, min(free_len[before], min(free_len[first], wedge[before])))
     i = first
@@ -314,39 +338,31 @@ def insert_fan(
                     found += 1
         if free_len[i] - reach > SPIKE_CELLS:
             start = max(0.0, reach - 1.0)
-            to_list += line_length(
-                ox + start * ray_x[i], oy + start * ray_y[i], ox + free_len[i] * ray_x[i], oy + free_len[i] * ray_y[i]
-            )
+            from_x[lines], from_y[lines] = ox + start * ray_x[i], oy + start * ray_y[i]
+            to_x[lines], to_y[lines] = ox + free_len[i] * ray_x[i], oy + free_len[i] * ray_y[i]
+            to_save += line_length(from_x[lines], from_y[lines], to_x[lines], to_y[lines])
+            lines += 1
         inner = outer
         i = nxt
-    needed[0], needed[1], needed[2] = found, to_list, row_hi - row_lo + 1
-    if found > room or to_list > saved_at.size or needed[2] > row_start.size:
+    needed[0], needed[1], needed[2] = found, to_save, row_hi - row_lo + 1
+    if found > room or to_save > saved_at.size or needed[2] > row_start.size:
         return False
 
-    count = 0
+    hits = 0
     for i in range(n):
         if hit_len[i] >= 0.0:
-            todo_row[count] = math.floor(oy + hit_len[i] * ray_y[i])
-            todo_col[count] = math.floor(ox + hit_len[i] * ray_x[i])
-            count += 1
-    hits = count
-    if to_list > n:
-        inner = max(0.0, min(free_len[n - 1], min(free_len[0], wedge[n - 1])))
-        for i in range(n):
-            nxt = i + 1 if i + 1 < n else 0
-            outer = max(0.0, min(free_len[i], min(free_len[nxt], wedge[i])))
-            reach = max(inner, outer)
-            if free_len[i] - reach > SPIKE_CELLS:
-                start = max(0.0, reach - 1.0)
-                count = list_line(
-                    ox + start * ray_x[i], oy + start * ray_y[i],
-                    ox + free_len[i] * ray_x[i], oy + free_len[i] * ray_y[i], count, todo_row, todo_col,
-                )  # fmt: skip
-            inner = outer
+            todo_row[hits] = math.floor(oy + hit_len[i] * ray_y[i])
+            todo_col[hits] = math.floor(ox + hit_len[i] * ray_x[i])
+            hits += 1
     saved = mark_cells(
-        count, hits, todo_row, todo_col, saved_at, saved_value, saved_kind, window, tile_row0, tile_col0, cells,
+        hits, hits, todo_row, todo_col, saved_at, saved_value, saved_kind, window, tile_row0, tile_col0, cells,
         index, tile_at, free_slots, flags, state,
     )  # fmt: skip
+    if lines > 0:
+        saved = mark_lines(
+            lines, from_x, from_y, to_x, to_y, saved, saved_at, saved_value, saved_kind, window, tile_row0, tile_col0,
+            cells, index, tile_at, free_slots, flags, state,
+        )  # fmt: skip
     if found > 0:
         fill_spans(
             found, cross_row, cross_col, sorted_col, row_start, row_lo, row_hi - row_lo, oy, window, tile_row0,
@@ -391,7 +407,8 @@ def beam_lengths(
 def insert_scan(
     ox: float, oy: float, cos_yaw: float, sin_yaw: float, range_m: Any, per_m: float, range_min_m: float,
     range_max_m: float, use_max_m: float, clear_no_return: bool, dir_x: Any, dir_y: Any, wedge: Any, free_len: Any,
-    hit_len: Any, ray_x: Any, ray_y: Any, cross_row: Any, cross_col: Any, sorted_col: Any, row_start: Any,
+    hit_len: Any, ray_x: Any, ray_y: Any, from_x: Any, from_y: Any, to_x: Any, to_y: Any,
+    cross_row: Any, cross_col: Any, sorted_col: Any, row_start: Any,
     todo_row: Any, todo_col: Any, saved_at: Any, saved_value: Any, saved_kind: Any, needed: Any,
     window: Any, tile_row0: int, tile_col0: int, cells: Any, index: Any, tile_at: Any, free_slots: Any, flags: Any,
     state: Any, model: int, rule: Any,
@@ -403,7 +420,8 @@ def insert_scan(
         return True
     return bool(
         insert_fan(
-            ox, oy, cos_yaw, sin_yaw, dir_x, dir_y, wedge, free_len, hit_len, ray_x, ray_y, cross_row, cross_col,
+            ox, oy, cos_yaw, sin_yaw, dir_x, dir_y, wedge, free_len, hit_len, ray_x, ray_y, from_x, from_y,
+            to_x, to_y, cross_row, cross_col,
             sorted_col, row_start, todo_row, todo_col, saved_at, saved_value, saved_kind, needed, window, tile_row0,
             tile_col0, cells, index, tile_at, free_slots, flags, state, model, rule,
         )
@@ -412,37 +430,28 @@ def insert_scan(
 
 @njit(cache=True, nogil=True)
 def insert_lines(
-    from_x: Any, from_y: Any, to_x: Any, to_y: Any, free: Any, hit: Any,
-    todo_row: Any, todo_col: Any, saved_at: Any, saved_value: Any, saved_kind: Any, needed: Any,
+    lines: int, from_x: Any, from_y: Any, to_x: Any, to_y: Any, hits: int, todo_row: Any, todo_col: Any,
+    saved_at: Any, saved_value: Any, saved_kind: Any, needed: Any,
     window: Any, tile_row0: int, tile_col0: int, cells: Any, index: Any, tile_at: Any, free_slots: Any, flags: Any,
     state: Any, model: int, rule: Any,
 ) -> bool:  # fmt: skip
-    """One scan whose beams start at different places, each (N,) in cells: hits at the ends, misses along the lines.
+    """One scan whose beams start at different places: `hits` listed cells, and misses along `lines` lines, in cells.
 
-    free, hit: (N,) whether the line is free, whether its end is an obstacle.
-    Returns False, with nothing changed, if the work arrays are too small; needed[1]: listed cells.
+    Returns False, with nothing changed, if the work arrays are too small; needed[1]: cells to put aside.
     """
-    n = from_x.size
-    to_list = n
-    for i in range(n):
-        if free[i]:
-            to_list += line_length(from_x[i], from_y[i], to_x[i], to_y[i])
-    needed[0], needed[1], needed[2] = 0, to_list, 0
-    if to_list > saved_at.size:
+    to_save = hits
+    for k in range(lines):
+        to_save += line_length(from_x[k], from_y[k], to_x[k], to_y[k])
+    needed[0], needed[1], needed[2] = 0, to_save, 0
+    if to_save > saved_at.size:
         return False
-    count = 0
-    for i in range(n):
-        if hit[i]:
-            todo_row[count] = math.floor(to_y[i])
-            todo_col[count] = math.floor(to_x[i])
-            count += 1
-    hits = count
-    for i in range(n):
-        if free[i]:
-            count = list_line(from_x[i], from_y[i], to_x[i], to_y[i], count, todo_row, todo_col)
     saved = mark_cells(
-        count, hits, todo_row, todo_col, saved_at, saved_value, saved_kind, window, tile_row0, tile_col0, cells,
+        hits, hits, todo_row, todo_col, saved_at, saved_value, saved_kind, window, tile_row0, tile_col0, cells,
         index, tile_at, free_slots, flags, state,
+    )  # fmt: skip
+    saved = mark_lines(
+        lines, from_x, from_y, to_x, to_y, saved, saved_at, saved_value, saved_kind, window, tile_row0, tile_col0,
+        cells, index, tile_at, free_slots, flags, state,
     )  # fmt: skip
     settle_cells(saved, saved_at, saved_value, saved_kind, cells, model, rule)
     return True
@@ -510,3 +519,91 @@ def changed_rectangle(new: Any, old: Any, rectangle: Any) -> bool:
                 col1 = max(col1, col + 1)
     rectangle[0], rectangle[1], rectangle[2], rectangle[3] = row0, row1, col0, col1
     return bool(row1 > row0)
+
+
+@njit(cache=True, nogil=True)
+def measure_lines(origin: Any, end: Any, some: Any, out: Any) -> bool:
+    """Of the lines that prove something: place of the middle one's origin, its farthest fellow, the longest line.
+
+    origin, end: (N, 2).  some: (N,).  out: (4,) x, y, spread of the origins, longest.
+    False if none proves anything. Not finite where a place is not.
+    """
+    count = 0
+    for i in range(some.size):
+        count += some[i]
+    if count == 0:
+        return False
+    to_skip = count // 2
+    for i in range(some.size):
+        if some[i]:
+            if to_skip == 0:
+                out[0], out[1] = origin[i, 0], origin[i, 1]
+                break
+            to_skip -= 1
+    spread, longest, sound = 0.0, 0.0, 0.0
+    for i in range(some.size):
+        if some[i]:
+            x, y = origin[i, 0] - out[0], origin[i, 1] - out[1]
+            spread = max(spread, x * x + y * y)
+            x, y = end[i, 0] - origin[i, 0], end[i, 1] - origin[i, 1]
+            longest = max(longest, x * x + y * y)
+            sound += 0.0 * (origin[i, 0] + origin[i, 1] + end[i, 0] + end[i, 1])  # NaN from NaN and from inf
+    out[2], out[3] = math.sqrt(spread) + sound, math.sqrt(longest) + sound
+    return True
+
+
+@njit(cache=True, nogil=True)
+def fan_of_lines(
+    x0: float, y0: float, spread: float, end: Any, free: Any, hit: Any, dir_x: Any, dir_y: Any, gap: Any,
+    adjacent: Any, free_len: Any, hit_len: Any,
+) -> int:  # fmt: skip
+    """Lines as seen from (x0, y0), counter-clockwise; the fast way of mapping.grids.beam_model.fan_of_beams.
+
+    gap, adjacent: (N,) angle to the next line (the last: to the first), and whether none was left out in between.
+    Other outputs as in insert_fan, in metres. Returns how many lines there are; 0 if they are fewer than three or do
+    not all run one way round, in less than a turn and in steps of less than a right angle: then they must be sorted.
+    """
+    count, before, start = 0, -1, -1
+    turn, way = 0.0, 0.0
+    for i in range(free.size):
+        if not (free[i] or hit[i]):
+            continue
+        x, y = end[i, 0] - x0, end[i, 1] - y0
+        length = math.sqrt(x * x + y * y)
+        if length == 0.0:
+            return 0
+        x, y = x / length, y / length
+        if count > 0:
+            sine = dir_x[count - 1] * y - dir_y[count - 1] * x
+            if sine * way < 0.0 or sine == 0.0 or dir_x[count - 1] * x + dir_y[count - 1] * y <= 0.0:
+                return 0
+            way = sine
+            gap[count - 1] = math.asin(min(abs(sine), 1.0))
+            turn += gap[count - 1]
+            adjacent[count - 1] = i == before + 1
+        else:
+            start = i
+        dir_x[count], dir_y[count] = x, y
+        free_len[count] = -1.0 if not free[i] else length if hit[i] else max(length - spread, 0.0)
+        hit_len[count] = length if hit[i] else -1.0
+        before = i
+        count += 1
+    if count < 3 or turn > 2.0 * math.pi - 1e-6:
+        return 0
+    last = count - 1
+    closing = (dir_x[last] * dir_y[0] - dir_y[last] * dir_x[0]) * (1.0 if way > 0.0 else -1.0)
+    closes = turn > math.pi and closing > 0.0 and dir_x[last] * dir_x[0] + dir_y[last] * dir_y[0] > 0.0
+    gap[last] = math.asin(min(closing, 1.0)) if closes else math.pi
+    adjacent[last] = closes and start == 0 and before == free.size - 1
+    if way < 0.0:
+        for k in range(count // 2):
+            j = last - k
+            dir_x[k], dir_x[j] = dir_x[j], dir_x[k]
+            dir_y[k], dir_y[j] = dir_y[j], dir_y[k]
+            free_len[k], free_len[j] = free_len[j], free_len[k]
+            hit_len[k], hit_len[j] = hit_len[j], hit_len[k]
+        for k in range(last // 2):
+            j = last - 1 - k
+            gap[k], gap[j] = gap[j], gap[k]
+            adjacent[k], adjacent[j] = adjacent[j], adjacent[k]
+    return count

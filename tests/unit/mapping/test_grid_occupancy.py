@@ -283,7 +283,7 @@ def test_settings_that_make_no_sense_are_refused() -> None:
         OccupancyGrid(model="both")  # type: ignore[arg-type]
     for option in ({"resolution_m": 0.0}, {"max_tiles": 0}, {"fill_gap_m": -1.0}, {"use_max_m": 0.0}):
         with pytest.raises(ValueError, match=r"."):
-            OccupancyGrid(**option)  # type: ignore[arg-type]
+            OccupancyGrid(**option)
     with pytest.raises(ValueError, match="votes"):
         SonarRules(echo_votes=4)
 
@@ -489,6 +489,40 @@ def test_a_huge_payload_is_not_unpacked() -> None:
 
 def test_the_same_scans_give_the_same_bytes() -> None:
     assert list(busy_grid("counters", True).tiles()) == list(busy_grid("counters", True).tiles())
+
+
+def test_warming_up_leaves_nothing_to_compile() -> None:
+    """In a process of its own: after warm_up no kernel that a running daemon calls gets a new signature."""
+    code = """
+import numpy as np
+from numba.core.registry import CPUDispatcher
+from mapping.frames import Pose2
+from mapping.grids.beam_model import beams_of_scan
+from mapping.grids.occupancy import OccupancyGrid
+from mapping.grids.warm_up import warm_up
+from mapping.kernels import clearance, grids, sonar_cones
+from mapping.scan import Scan
+
+def compiled():
+    kernels = [k for m in (grids, sonar_cones, clearance) for k in vars(m).values() if isinstance(k, CPUDispatcher)]
+    return sum(len(k.signatures) for k in kernels)
+
+warm_up()
+before = compiled()
+bearing = np.linspace(-2.0, 2.0, 200)
+for model in ("counters", "log-odds"):
+    grid = OccupancyGrid(model=model)
+    for k in range(3):
+        ranges = np.full(200, 3.0 + k)
+        grid.insert_scan(Pose2(k, 0, 1), bearing, ranges, range_max_m=30, range_min_m=0, clear_no_return=False)
+        poses = np.stack((np.full(200, 0.5) * k, np.linspace(0, k, 200), np.zeros(200)), axis=-1)
+        grid.insert_beams(beams_of_scan(Scan(0, 0.0, bearing, ranges, 0.1, 30), poses))
+        grid.insert_cone(Pose2(), 1, cone_rad=1, range_max_m=2, transducer="a")
+        grid.insert_cells(np.array([[0, 0]]), [])
+    grid.patch(), grid.take_changes(), grid.changed_tiles()
+assert compiled() == before, (before, compiled())
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_light_parts_of_mapping_do_not_load_compiled_kernels() -> None:

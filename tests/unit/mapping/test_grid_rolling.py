@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.grids.occupancy import OccupancyGrid
@@ -19,10 +20,11 @@ D = 0.1
 STEP = st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(-3.0, 3.0), st.integers(0, 1000))
 
 
-def scan_of(seed: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def scan_of(seed: int) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
     ranges = rng.uniform(0.3, 6.0, BEARING.size)
-    return np.where(rng.random(BEARING.size) < 0.1, rng.choice([np.inf, np.nan, -np.inf], BEARING.size), ranges)
+    strange = rng.choice([np.inf, np.nan, -np.inf], BEARING.size)
+    return np.asarray(np.where(rng.random(BEARING.size) < 0.1, strange, ranges), dtype=np.float64)
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -1,0 +1,34 @@
+"""Load or compile every kernel of the grids before a device is opened: a first call takes up to some seconds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mapping.frames import Pose2
+from mapping.grids.beam_model import beams_of_scan
+from mapping.grids.clearance import clearance_layer
+from mapping.grids.evidence import Model
+from mapping.grids.occupancy import OccupancyGrid
+from mapping.scan import Scan
+
+
+def warm_up(model: Model = "counters") -> None:
+    """Use a grid that is thrown away in all the ways a daemon does; both models share their kernels."""
+    bearing = np.linspace(-1.0, 1.0, 9)
+    ranges = np.array([1.0, 1.0, np.inf, 2.0, 1.0, np.nan, -np.inf, 1.0, 1.0])
+    grid = OccupancyGrid(model=model, max_tiles=16)
+    grid.insert_scan(Pose2(), bearing, ranges, range_max_m=2.0, range_min_m=0.1)
+    for drift_m in (0.0, 1.0):  # as a fan, and line by line
+        poses = np.stack(
+            (np.linspace(0.0, drift_m, bearing.size), np.zeros(bearing.size), np.zeros(bearing.size)), axis=-1
+        )
+        grid.insert_beams(beams_of_scan(Scan(0, 0.0, bearing, ranges, 0.1, 2.0), poses))
+    grid.insert_cells([(0, 0)], [(0, 1)])
+    grid.insert_cone(Pose2(), 1.0, cone_rad=math.radians(30.0), range_max_m=2.0)
+    grid.take_changes()
+    grid.decay()
+    for row, col, payload in list(grid.tiles()):
+        grid.load_tile(row, col, payload)
+    clearance_layer(grid.patch())
