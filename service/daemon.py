@@ -16,6 +16,7 @@ import faulthandler
 import hashlib
 import logging
 import os
+import select
 import signal
 import sys
 import threading
@@ -49,6 +50,7 @@ EXIT_DEADLINE_S = 8.0  # systemd would kill after 10
 _WIRE_STOP_S = 1.5
 _FUSION_STOP_S = 2.0
 _PUBLISHER_STOP_S = 2.0
+_GIL_SWITCH_S = 0.001  # a scan passes through three threads; by default each may wait 5 ms for the one that computes
 
 
 class Daemon:
@@ -61,7 +63,6 @@ class Daemon:
         self._sensors = assemble.sensors(self._config)
         self._parts = contextlib.ExitStack()
         self._readers: list[WireReader[Any]] = []
-        self._stop_asked = threading.Event()
         self._clean = True
         self._meter = health.ProcessMeter(self._clock.now_ns())
 
@@ -70,17 +71,18 @@ class Daemon:
     def run(self) -> int:
         """Start, wait for SIGINT or SIGTERM, stop; returns the exit code. Trouble if it cannot start."""
         faulthandler.enable(file=sys.__stderr__ or sys.stderr)
-        with _signals(self._stop_asked.set):
+        with _StopSignals() as asked:
+            self.start()
             try:
-                self.start()
                 self._notifier.ready(self._summary())
                 log.info("%s", self._summary())
-                while not self._stop_asked.wait(1.0):
+                while not asked.wait(1.0):
                     self._notifier.status(self._summary())
             finally:
+                log.info("stopping: closing ports, saving the map")
                 self._notifier.stopping("closing ports and saving the map")
-                with _exit_deadline(EXIT_DEADLINE_S):
-                    clean = self.stop()
+                clean = self.stop()
+        log.info("stopped")
         return 0 if clean else 1
 
     def start(self) -> None:
@@ -92,12 +94,17 @@ class Daemon:
             raise
 
     def stop(self) -> bool:
-        """Take everything down in the reverse order; False if something did not stop in time."""
+        """Take everything down in the reverse order, or end the process after EXIT_DEADLINE_S.
+
+        False if something did not stop in time.
+        """
         self._clean = True
-        self._parts.close()
+        with _exit_deadline(EXIT_DEADLINE_S):
+            self._parts.close()
         return self._clean
 
     def _start_parts(self) -> None:
+        sys.setswitchinterval(_GIL_SWITCH_S)
         config, wires = self._config, assemble.wires(self._config)
         claims = self._parts.enter_context(Claims())
         claims.claim_ports(wire.port for wire in wires if wire.port is not None)
@@ -317,24 +324,39 @@ def _in_thread(name: str, work: Callable[[], object]) -> Callable[[], None]:
     return wait
 
 
-@contextlib.contextmanager
-def _signals(stop: Callable[[], None]) -> Iterator[None]:
-    """SIGINT and SIGTERM call stop(); the second one ends the process at once."""
-    count = 0
+class _StopSignals:
+    """SIGINT and SIGTERM ask to stop; the second one ends the process at once. A context manager.
 
-    def handle(number: int, _frame: FrameType | None) -> None:
-        nonlocal count
-        count += 1
-        if count > 1:
-            os._exit(128 + number)
-        stop()
+    The handler only counts: anything with a lock in it could meet itself. A pipe, written by the interpreter's own
+    handler in whichever thread the signal arrives, wakes the main thread.
+    """
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
+    def __init__(self) -> None:
+        self._count = 0
+
+    def __enter__(self) -> _StopSignals:
+        self._reading, self._writing = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._wakeup_before = signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        signal.set_wakeup_fd(self._wakeup_before)
+        for number, handler in self._before.items():
             signal.signal(number, handler)
+        os.close(self._reading)
+        os.close(self._writing)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether stopping was asked for, waiting for it."""
+        if self._count == 0:
+            select.select([self._reading], [], [], timeout_s)
+        return self._count > 0
+
+    def _handle(self, number: int, _frame: FrameType | None) -> None:
+        self._count += 1
+        if self._count > 1:
+            os._exit(128 + number)
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ Input never stops fusion. What cannot be used is dropped and counted by source a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -184,6 +184,10 @@ class Fusion:
 
     def on_item(self, source: str, item: Reading | DeviceEvent, now_ns: int) -> list[Output]:
         """Take one reading or event of a source; returns what it changes, in the order to publish."""
+        return list(self.stream(source, item, now_ns))
+
+    def stream(self, source: str, item: Reading | DeviceEvent, now_ns: int) -> Iterable[Output]:
+        """As on_item, each output as soon as it is ready; to be exhausted before anything else is asked of fusion."""
         if isinstance(item, DeviceEvent):
             return self._on_event(source, item, now_ns)
         sensor = self._parts.sensors.get(source)
@@ -253,11 +257,10 @@ class Fusion:
 
     # --- lasers
 
-    def _on_scan(self, laser: Laser, reading: ScanReading, now_ns: int) -> list[Output]:
+    def _on_scan(self, laser: Laser, reading: ScanReading, now_ns: int) -> Iterator[Output]:
         scan = self._checked_scan(laser, reading)
         if scan is None:
-            return []
-        outputs: list[Output] = [ScanOut(laser.name, scan, laser.base_from_sensor, laser.height_m)]
+            return
         sweep_ns = _last_beam_ns(scan) - scan.stamp_ns
         self._fresh_until_ns[laser.name] = min(scan.stamp_ns, now_ns) + stale_after_ns(reading.scan_period_ns, sweep_ns)
         if fed := self._fed_by(laser.name):
@@ -267,10 +270,10 @@ class Fusion:
             )  # ages count from the first beam, never from later
             for index in fed:
                 self._parts.sectors[index].take_scan(laser.name, seen, base_from_sensor)
-                outputs.append(self._tell(index, now_ns))
+                yield self._tell(index, now_ns)
+        yield ScanOut(laser.name, scan, laser.base_from_sensor, laser.height_m)
         self._newest_stamp_ns = max(self._newest_stamp_ns, scan.stamp_ns)
         self._wait_for_poses(laser.name, scan, scan.stamp_ns, _last_beam_ns(scan), now_ns)
-        return outputs
 
     def _checked_scan(self, laser: Laser, reading: ScanReading) -> Scan | None:
         bearing = np.asarray(reading.bearing_rad, dtype=np.float64)

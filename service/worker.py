@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import TypeVar
 
@@ -140,9 +140,9 @@ class Worker:
         self.turn(0.0)
 
     def _take(self, source: str, item: Reading | DeviceEvent) -> None:
-        self._guard(source, lambda: self._fusion.on_item(source, item, self._now_ns()))
+        self._guard(source, lambda: self._fusion.stream(source, item, self._now_ns()))
 
-    def _guard(self, source: str, work: Callable[[], list[Output]]) -> None:
+    def _guard(self, source: str, work: Callable[[], Iterable[Output]]) -> None:
         """No reading may end the daemon: a bug is logged with its traceback once a kind, counted, and work goes on."""
         try:
             for output in work():

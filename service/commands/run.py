@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -33,4 +35,7 @@ def run(
     )
     from service.daemon import Daemon
 
-    raise typer.Exit(Daemon(loaded).run())
+    code = Daemon(loaded).run()
+    logging.shutdown()
+    sys.stdout.flush()
+    os._exit(code)  # all is closed; taking the interpreter and the compiled kernels apart would cost a second or two

@@ -90,12 +90,12 @@ def test_health_comes_every_second_and_at_once_when_a_device_changes() -> None:
 
 def test_a_bug_costs_one_reading_not_the_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
     office = Office()
-    good = office.fusion.on_item
-    monkeypatch.setattr(office.fusion, "on_item", lambda *_: 1 / 0)
+    good = office.fusion.stream
+    monkeypatch.setattr(office.fusion, "stream", lambda *_: 1 / 0)
     office.worker.sink("front", scan(SECOND))
     office.worker.turn(0.0)
-    monkeypatch.setattr(office.fusion, "on_item", good)
-    office.worker.sink("front", scan(2 * SECOND))
+    monkeypatch.setattr(office.fusion, "stream", good)
+    office.worker.sink("front", scan(SECOND))
     office.worker.turn(0.0)
     assert office.worker.counters()["fusion.errors"] == 1
     assert sum(isinstance(each, ScanOut) for each in office.told) == 1
@@ -135,7 +135,7 @@ def test_a_flood_is_bounded_and_counted_but_events_survive(monkeypatch: pytest.M
         seen.append(item)
         return []
 
-    monkeypatch.setattr(office.fusion, "on_item", remember)
+    monkeypatch.setattr(office.fusion, "stream", remember)
     office.worker.turn(0.0)
     assert isinstance(seen[0], DeviceEvent)
 

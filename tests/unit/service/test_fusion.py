@@ -155,10 +155,10 @@ def wheels(stamp_ns: int, left: int, right: int, *, continuous: bool = True) -> 
 def test_a_scan_is_published_at_once_and_feeds_the_sectors() -> None:
     b = bench()
     outputs = b.fusion.on_item("front", scan(100 * MS), 130 * MS)
-    assert [type(each) for each in outputs] == [ScanOut, PolarOut]
-    assert isinstance(outputs[0], ScanOut)
-    assert outputs[0].scan.stamp_ns == 100 * MS
-    assert outputs[0].height_m == 0.25
+    assert [type(each) for each in outputs] == [PolarOut, ScanOut]
+    assert isinstance(outputs[1], ScanOut)
+    assert outputs[1].scan.stamp_ns == 100 * MS
+    assert outputs[1].height_m == 0.25
     assert len(b.sectors.scans) == 1
     assert b.grid.sweeps == []  # no odometry has been heard yet
 
@@ -296,8 +296,8 @@ def test_impossible_ranges_become_invalid_and_the_others_stay() -> None:
     given = np.array([0.0, -1.0, 10.5, np.inf, -np.inf, np.nan, 5.0])
     reading = replace(scan(0, beams=7), range_m=given)
     outputs = b.fusion.on_item("front", reading, 1)
-    assert isinstance(outputs[0], ScanOut)
-    assert np.array_equal(outputs[0].scan.range_m, [np.nan] * 3 + [np.inf, -np.inf, np.nan, 5.0], equal_nan=True)
+    assert isinstance(outputs[1], ScanOut)
+    assert np.array_equal(outputs[1].scan.range_m, [np.nan] * 3 + [np.inf, -np.inf, np.nan, 5.0], equal_nan=True)
     assert b.fusion.drops["front"] == {"range_out_of_bounds": 3}
     assert given[0] == 0.0  # the reading itself is not ours to change
 
