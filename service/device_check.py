@@ -13,7 +13,7 @@ from drivers.readings import LinkState
 from service import assemble
 from service.config import Config
 from service.errors import Trouble
-from service.health import identity_text
+from service.health import identity_text, trouble_of
 from service.locks import Claims
 
 _LISTEN_S = 1.0  # so long after the first reading, for a rate
@@ -104,7 +104,7 @@ def _wait_for_all(
 
 
 def _found(source: SourceHealth, kind: str, where: str) -> Found:
-    trouble = source.trouble
+    trouble = trouble_of(source)
     if trouble is None and source.state is not LinkState.RUNNING:
         trouble = "no reading arrived in time; check its power and cable, or give it longer (--seconds)"
     return Found(

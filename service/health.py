@@ -58,15 +58,16 @@ def _all_well(sources: Sequence[SourceHealth]) -> str:
 
 
 def _source(source: reader.SourceHealth, kind: str, fusion_drops: Mapping[str, int]) -> SourceHealth:
+    trouble = trouble_of(source)
     drops = dict(source.counters.drops)
     for reason, count in fusion_drops.items():
         drops[reason] = drops.get(reason, 0) + count
     return SourceHealth(
         name=source.name,
         kind=kind,
-        level=level_of(source.state, source.trouble, had_readings=source.readings > 0),
+        level=level_of(source.state, trouble, had_readings=source.readings > 0),
         state=source.state.name.lower(),
-        text=source.trouble or source.state.name.lower(),
+        text=trouble or source.state.name.lower(),
         identity=identity_text(source.identity),
         rate_hz=source.rate_hz,
         age_ns=-1 if source.age_ns is None else source.age_ns,
@@ -74,6 +75,23 @@ def _source(source: reader.SourceHealth, kind: str, fusion_drops: Mapping[str, i
         drops=dict(sorted(drops.items())),
         clock=_clock(source.clock_fit),
     )
+
+
+def trouble_of(source: reader.SourceHealth) -> str | None:
+    """What is wrong with a device, in words; where it only keeps silent, what that hints at."""
+    if source.state is LinkState.SILENT and source.readings == 0 and source.identity is None:
+        said = source.trouble or "no answer yet"
+        if source.counters.bytes:
+            return (
+                f"{said}; {source.counters.bytes} bytes came that are not its language: is another device on this port, "
+                "or the line speed another? (driver, port, baud_bps)"
+            )
+        if said == _NO_ANSWER:
+            return f"{said}: check its power and cable, and that this port is its own"
+    return source.trouble
+
+
+_NO_ANSWER = "no answer yet"
 
 
 def level_of(state: LinkState, trouble: str | None, *, had_readings: bool) -> int:

@@ -10,7 +10,7 @@ import pytest
 
 from drivers import reader
 from drivers.readings import ClockFit, Identity, LinkState, SourceCounters
-from service.health import ERROR, OK, STALE, WARNING, Inside, ProcessMeter, identity_text, level_of, report
+from service.health import ERROR, OK, STALE, WARNING, Inside, ProcessMeter, identity_text, level_of, report, trouble_of
 
 
 def source(name: str, state: LinkState = LinkState.RUNNING, **changes: object) -> reader.SourceHealth:
@@ -99,6 +99,22 @@ def test_the_clock_fit_is_reported() -> None:
 )
 def test_levels(state: LinkState, trouble: str | None, had_readings: bool, level: int) -> None:
     assert level_of(state, trouble, had_readings=had_readings) == level
+
+
+def test_silence_says_what_it_hints_at() -> None:
+    quiet = source("front", LinkState.SILENT, trouble="no answer yet", readings=0, identity=None)
+    assert "power and cable" in str(trouble_of(quiet))
+    noisy = source(
+        "front",
+        LinkState.SILENT,
+        trouble="no answer yet",
+        readings=0,
+        identity=None,
+        counters=SourceCounters(bytes=680),
+    )
+    assert "680 bytes came" in str(trouble_of(noisy))
+    assert "another device" in str(trouble_of(noisy))
+    assert trouble_of(source("front")) is None
 
 
 def test_an_identity_says_only_what_is_known() -> None:
