@@ -83,8 +83,8 @@ def trouble_of(source: reader.SourceHealth) -> str | None:
         said = source.trouble or "no answer yet"
         if source.counters.bytes:
             return (
-                f"{said}; {source.counters.bytes} bytes came that are not its language: is another device on this port, "
-                "or the line speed another? (driver, port, baud_bps)"
+                f"{said}; {source.counters.bytes} bytes came that are not its language: another device on this port, "
+                "or another line speed? (driver, port, baud_bps)"
             )
         if said == _NO_ANSWER:
             return f"{said}: check its power and cable, and that this port is its own"

@@ -113,7 +113,7 @@ def test_silence_says_what_it_hints_at() -> None:
         counters=SourceCounters(bytes=680),
     )
     assert "680 bytes came" in str(trouble_of(noisy))
-    assert "another device" in str(trouble_of(noisy))
+    assert "another device on this port" in str(trouble_of(noisy))
     assert trouble_of(source("front")) is None
 
 
