@@ -25,3 +25,22 @@ def usboard_crc(data: bytes) -> int:
         crc ^= byte | previous << 8
         previous = byte
     return crc
+
+
+def sick_crc(data: bytes) -> int:
+    """The 16-bit code after a SICK LMS2xx telegram: polynomial 8005h over byte pairs, start 0."""
+    crc = previous = 0
+    for byte in data:
+        crc = ((crc & 0x7FFF) << 1) ^ 0x8005 if crc & 0x8000 else crc << 1
+        crc ^= byte | previous << 8
+        previous = byte
+    return crc
+
+
+def crc16_ccitt(data: bytes, crc: int = 0) -> int:
+    """CRC-16 of RoboClaw packets: polynomial 1021h, start 0, highest bit first. crc: of what went before."""
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
+    return crc

@@ -60,6 +60,11 @@ class PacedWire:
         return self._promised_ns > now_ns
 
     @property
+    def free_ns(self) -> int:
+        """When all that is queued will have left; in the past if the wire is idle."""
+        return self._promised_ns
+
+    @property
     def is_empty(self) -> bool:
         """Whether all has left."""
         return not self._waiting

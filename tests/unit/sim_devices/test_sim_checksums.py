@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_devices.checksums import scip_sum, scip_sums, usboard_crc
+from sim_devices.checksums import scip_sum, scip_sums, sick_crc, usboard_crc
 
 
 @pytest.mark.parametrize(
@@ -54,3 +54,13 @@ def test_scip_sum_of_every_recorded_line() -> None:
     assert len(data) > 1900
     assert all(line[-1] == scip_sum(line[:-2]) for line in told)
     assert all(line[-1] == scip_sum(line[:-1]) for line in data)
+
+
+@pytest.mark.parametrize(
+    "telegram",
+    ["02 00 01 00 10 34 12", "02 00 02 00 20 24 34 08", "02 00 0A 00 20 00 53 49 43 4B 5F 4C 4D 53 BE C5",
+     "02 81 03 00 A0 00 10 36 1A", "02 80 0E 00 B0 05 40 E8 03 E9 03 FF 1F 51 00 C4 09 10 B3 42"],
+)  # fmt: skip
+def test_sick_crc_of_published_telegrams(telegram: str) -> None:
+    octets = bytes.fromhex(telegram)
+    assert sick_crc(octets[:-2]).to_bytes(2, "little") == octets[-2:]
