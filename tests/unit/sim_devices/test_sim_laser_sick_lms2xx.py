@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from sim_devices.checksums import sick_crc
 from sim_devices.device import F64, Mount
@@ -47,8 +48,8 @@ POWER_ON = bytes.fromhex("02 80 17 00 90") + b"LMS200;301063;V02.10 " + bytes.fr
 class Field:
     """A scene that gives the beam at a degrees (0 right, 90 ahead) `range_at(a)`, and notes when beams were fired."""
 
-    def __init__(self, ranges_m: F64 | float = 3.0) -> None:
-        self.ranges_m = np.asarray(ranges_m, dtype=np.float64)
+    def __init__(self, ranges_m: ArrayLike = 3.0) -> None:
+        self.ranges_m: F64 = np.asarray(ranges_m, dtype=np.float64)
         self.fired: list[tuple[F64, F64]] = []
 
     def beam_ranges(self, mount: Mount, bearing_rad: F64, stamp_ns: F64, range_max_m: float) -> F64:
@@ -68,7 +69,7 @@ class Field:
 class Bench:
     """A scanner on a wire with the time in hand; the host's rate follows what it is told."""
 
-    def __init__(self, ranges_m: F64 | float = 3.0, *, boot: bool = True, **options: object) -> None:
+    def __init__(self, ranges_m: ArrayLike = 3.0, *, boot: bool = True, **options: object) -> None:
         self.scene = Field(ranges_m)
         self.laser = SickLms2xxLaser(self.scene, **({"noise_scale": 0.0} | options))  # type: ignore[arg-type]
         self.baud: int | None = 9600
@@ -325,7 +326,7 @@ def test_measuring_mode_sets_the_bits_of_a_distance(mode: int, top: int) -> None
     bench.ask(STOP)
     bench.at_rate(TO_500000, 500000)
     assert set(words(telegrams(bench.ask(ONE_SCAN))[0])[1]) == {top - 8}
-    bench.scene.ranges_m = np.float64(8.1)
+    bench.scene.ranges_m = np.array(8.1)
     assert set(words(telegrams(bench.ask(ONE_SCAN))[0])[1]) == {8100}
 
 
