@@ -105,7 +105,61 @@ class WheelReading:
     continuous: bool
 
 
-Reading = ScanReading | ChainReading | WheelReading
+class ContactState(IntEnum):
+    """What a switch says: of a bumper that it touches, of a cliff sensor that the floor is missing."""
+
+    CLEAR = 0
+    TRIPPED = 1
+    UNKNOWN = 2  # not answered any more, or not yet
+
+
+@dataclass(frozen=True, slots=True)
+class ContactLine:
+    """One switch. line: its number on the device (a pin), as printed there."""
+
+    line: int
+    state: ContactState
+
+
+@dataclass(frozen=True, slots=True)
+class ContactReading:
+    """One or more switches read at one instant. What each one means (bumper, cliff) and where it sits is not said here.
+
+    Sent again at the device's own rate also when nothing changes: silence is a fault, not "clear".
+    """
+
+    stamp_ns: int
+    lines: tuple[ContactLine, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseReading:
+    """Where another estimator says the robot is, in its own fixed frame: z up, yaw counter-clockwise.
+
+    continuous is False for the first one and wherever the estimator began anew: the step before is then no motion.
+    quality: 0 to 1, None if not told.
+    """
+
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    continuous: bool
+    quality: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeReading:
+    """How the robot is tilted (x forward, y left, z up): roll right side down, pitch nose down, yaw to the left."""
+
+    stamp_ns: int
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    rates_rad_s: tuple[float, float, float]
+
+
+Reading = ScanReading | ChainReading | WheelReading | ContactReading | PoseReading | AttitudeReading
 
 
 class LinkState(IntEnum):
