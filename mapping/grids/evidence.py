@@ -328,7 +328,7 @@ class EvidenceGrid:
         guards = guard_rows(self._sonar.guards(transducer), self.resolution_m)
         self._sonar.remember(transducer, cone)
         d, rules = self.resolution_m, self._sonar_rules
-        window = self._window_around(ox, oy, (range_max_m + cone.arc_half_m) / d)
+        window = self._window_around(ox, oy, (range_max_m + cone.arc_half_m + rules.explain_m) / d)
         if window is None:
             return True
         pool = self._pool
@@ -343,6 +343,12 @@ class EvidenceGrid:
                 rules.highest_log_odds / step,
             ]
         )
+        if cone.arc_m >= 0.0 and sonar_cones.echo_explained(
+            ox, oy, cone.axis_x, cone.axis_y, cone.cos_half, cone.arc_m / d, (cone.arc_half_m + rules.explain_m) / d,
+            window, pool.tile_row0, pool.tile_col0, pool.cells, self._laser_percent,
+            math.ceil(100.0 * self.rules.occupied_from), pool.index,
+        ):  # fmt: skip
+            weights[0] = 0.0  # the arc's other cells have no claim to be where this echo came from
         sonar_cones.insert_cone(
             ox, oy, cone.axis_x, cone.axis_y, cone.cos_half, cone.arc_m / d, cone.arc_half_m / d,
             cone.free_from_m / d, cone.free_m / d, weights, guards, window, pool.tile_row0, pool.tile_col0, pool.sonar,

@@ -16,6 +16,10 @@ Lies are the rule with sonars, so one reading proves nothing:
   latest arc of every other transducer is left alone by free evidence until that transducer itself says otherwise, or
   has said nothing for GUARD_READINGS readings of the others.
 
+- An echo whose range is that of an obstacle which the laser knows in the cone has its reason: no other cell of the arc
+  gets evidence for an obstacle. What is left speaks of things that the laser does not see (glass, table edges, what is
+  above or below its plane); without this rule every wall grows arcs on both sides of what the cone really touched.
+
 The evidence is a layer of its own, log-odds within narrow bounds: however often a cone looks through a laser's wall,
 the wall stays (`mapping.kernels.grids.percent_of_tile` joins the two).
 """
@@ -44,7 +48,8 @@ MAX_TRANSDUCERS: Final = 256
 class SonarRules:
     """How much a cone's evidence weighs (log-odds) and how readings are believed.
 
-    arc_half_m: half the thickness of the arc (range noise; at least one cell is used).  edge_share: what part of the
+    arc_half_m: half the thickness of the arc (range noise; at least one cell is used).  explain_m: how much farther off
+    the arc a laser's obstacle may lie and still be the reason of the echo.  edge_share: what part of the
     arc's evidence is left at the edge of the cone.  no_return_share: how much of range_max_m, of the opening angle
     and of the free weight is used when nothing was heard.  echo_votes, silence_votes: of the last `memory` readings.
     """
@@ -55,6 +60,7 @@ class SonarRules:
     highest_log_odds: float = 2.5
     edge_share: float = 0.4
     arc_half_m: float = 0.05
+    explain_m: float = 0.1
     no_return_share: float = 0.5
     memory: int = 3
     echo_votes: int = 2
@@ -68,7 +74,7 @@ class SonarRules:
             raise ValueError(f"log-odds bounds are below and above 0, at most {127 * SONAR_STEP:.3f}")
         if self.lowest_log_odds < -127 * SONAR_STEP or not 0.0 <= self.edge_share <= 1.0:
             raise ValueError(f"log-odds are at least {-127 * SONAR_STEP:.3f}, edge_share 0 to 1")
-        if not 0.0 < self.no_return_share <= 1.0 or self.agree_m < 0.0 or self.arc_half_m < 0.0:
+        if not 0.0 < self.no_return_share <= 1.0 or min(self.agree_m, self.arc_half_m, self.explain_m) < 0.0:
             raise ValueError("no_return_share is above 0 and at most 1, lengths are not negative")
         if self.occupied_log_odds < 0.0 or self.free_log_odds < 0.0:
             raise ValueError("weights are not negative")

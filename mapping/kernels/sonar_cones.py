@@ -84,6 +84,34 @@ def insert_cone(
 
 
 @njit(cache=True, nogil=True)
+def echo_explained(
+    ox: float, oy: float, axis_x: float, axis_y: float, cos_half: float, arc_len: float, tolerance: float, window: Any,
+    tile_row0: int, tile_col0: int, laser_cells: Any, laser_percent: Any, occupied: int, index: Any,
+) -> bool:  # fmt: skip
+    """Whether the laser knows an obstacle in the cone whose nearest point is where the echo came from.
+
+    Lengths and places in cells. tolerance: how far off the arc a cell's centre may lie.  occupied: per cent from which
+    laser_percent[cell] is an obstacle.
+    """
+    far, near = arc_len + tolerance, max(arc_len - tolerance, 0.0)
+    row_lo, row_hi = max(window[0], math.floor(oy - far) - 1), min(window[1], math.floor(oy + far) + 2)
+    col_lo, col_hi = max(window[2], math.floor(ox - far) - 1), min(window[3], math.floor(ox + far) + 2)
+    for row in range(row_lo, row_hi):
+        y = row + 0.5 - oy
+        for col in range(col_lo, col_hi):
+            x = col + 0.5 - ox
+            distance = math.sqrt(x * x + y * y)
+            if distance < near or distance > far or x * axis_x + y * axis_y < cos_half * distance:
+                continue
+            slot: Any = np.int64(index[(row >> TILE_BITS) - tile_row0, (col >> TILE_BITS) - tile_col0])
+            if slot != 0:
+                at = (slot << (2 * TILE_BITS)) + ((row & TILE_MASK) << TILE_BITS) + (col & TILE_MASK)
+                if laser_percent[laser_cells[at]] >= occupied:
+                    return True
+    return False
+
+
+@njit(cache=True, nogil=True)
 def halve_sonar(cells: Any, start: int, stop: int) -> None:
     """Forget half of the evidence; a cell with nothing left becomes unknown."""
     for at in range(np.uint64(start), np.uint64(stop)):

@@ -87,7 +87,7 @@ export class GridImage {
   grow(patch) {
     for (let row = 0; row < patch.height; row++) {
       for (let col = 0; col < patch.width; col++) {
-        if (patch.cells[row * patch.width + col] < 0) continue;
+        if (patch.cells[row * patch.width + col] < 50) continue; // framed by its walls: a beam out of a window frees far space
         const x = patch.x + col, y = patch.y + row;
         if (x < this.box[0]) this.box[0] = x;
         if (y < this.box[1]) this.box[1] = y;
@@ -96,7 +96,7 @@ export class GridImage {
       }
     }
   }
-  // World corners of what is known, or null.
+  // World corners of what is occupied, or null.
   bounds() {
     if (!this.grid || this.box[2] < this.box[0]) return null;
     const { origin, resolution } = this.grid, xs = [], ys = [];

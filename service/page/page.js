@@ -84,9 +84,9 @@ function robotOf(key) {
 let baseChunks = 2;
 
 const HANDLERS = [
-  [/^scan\/(.+)$/, (robot, payload, _a, [name]) => robot.scans.set(name, cdr.laserScan(payload))],
-  [/^range\/(.+)$/, (robot, payload, _a, [name]) => robot.cones.set(name, json(payload))],
-  [/^sectors\/polar\/(.+)$/, (robot, payload, _a, [name]) => robot.polar.set(name, json(payload))],
+  [/^scan\/([^/]+)$/, (robot, payload, _a, [name]) => robot.scans.set(name, cdr.laserScan(payload))],
+  [/^range\/([^/]+)$/, (robot, payload, _a, [name]) => robot.cones.set(name, json(payload))],
+  [/^sectors\/polar\/([^/]+)$/, (robot, payload, _a, [name]) => robot.polar.set(name, json(payload))],
   [/^pose$/, (robot, payload) => robot.addPose(cdr.poseWithCovariance(payload))],
   [/^map\/grid$/, (robot, payload, attachment) => robot.grid.full(cdr.occupancyGrid(payload), epochOf(attachment))],
   [/^map\/grid\/update$/, (robot, payload, attachment) => {

@@ -223,3 +223,30 @@ def test_names_that_change_from_ping_to_ping_are_noticed() -> None:
         ping(grid, Pose2(), 1.0, f"ping {k}")
     with pytest.raises(ValueError, match="names"):
         ping(grid, Pose2(), 1.0, "one more")
+
+
+def walled_room(grid: OccupancyGrid, wall_m: float) -> None:
+    """A laser at the origin sees a wall at x = wall_m, up and down to 60 degrees."""
+    bearing = np.radians(np.arange(-60.0, 60.5, 0.5))
+    for _ in range(5):
+        grid.insert_scan(Pose2(0.01, 0.01), bearing, wall_m / np.cos(bearing), range_max_m=30.0)
+
+
+@SLOW
+@given(st.floats(-0.2, 0.2), st.floats(0.8, 2.0))
+def test_an_echo_from_a_known_wall_grows_no_arc(yaw: float, wall_m: float) -> None:
+    grid, before = OccupancyGrid(), OccupancyGrid()
+    for g in (grid, before):
+        walled_room(g, wall_m)
+    for _ in range(10):
+        ping(grid, Pose2(0.01, 0.01, yaw), wall_m)  # the cone holds the wall's nearest point, straight ahead
+    assert np.array_equal(grid.patch().cells >= 65, before.patch().cells >= 65)
+
+
+def test_an_echo_in_front_of_a_known_wall_is_something_the_laser_does_not_see() -> None:
+    grid = OccupancyGrid()
+    walled_room(grid, 2.0)
+    assert grid.state_at([[1.0, 0.0]])[0] == FREE
+    for _ in range(10):
+        ping(grid, Pose2(0.01, 0.01), 1.0)
+    assert grid.state_at([[1.0, 0.0]])[0] == OCCUPIED
