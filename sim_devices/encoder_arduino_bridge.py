@@ -34,6 +34,7 @@ BAUD = 57600
 PID_HZ = 30
 AUTO_STOP_NS = 2 * SECOND_NS
 ARGUMENT_LENGTH = 31
+TOP_TURNS_PER_S = 3.0  # of a wheel at full PWM
 RECEIVE_BUFFER = 64  # what a busy board can hold; the rest is lost
 TURN_AROUND_NS = 200_000  # from a CR to the first character of its reply
 NO_ECHO_NS = 38_000_000
@@ -61,7 +62,8 @@ class ArduinoBridge:
 
     left, right: its wheels; None builds the sketch without a base: `e`, `m`, `r`, `u` are invalid commands then.
     sonars, pins, analog: what is connected to which pin; a pin's function tells whether the line is high.
-    boot_s: from power-on or reset to the first command.  leading_blank: newer sketches print a blank before the baud.
+    boot_s: from power-on or reset to the first command.  Forks of the sketch: leading_blank prints a blank before the
+    baud, raw_pwm knows `o l r`, PWM of the motors (-255..255), baud_bps is another line rate.
     """
 
     fault_family = "encoder"
@@ -77,6 +79,8 @@ class ArduinoBridge:
         boot_s: float = 1.0,
         noise_m: float = 0.003,
         leading_blank: bool = False,
+        baud_bps: int = BAUD,
+        raw_pwm: bool = False,
         seed: int = 0,
     ) -> None:
         self.wheels: tuple[Wheel, ...] = () if left is None or right is None else (left, right)
@@ -87,9 +91,11 @@ class ArduinoBridge:
         self._scene: Scene | None = self.wheels[0].scene if self.wheels else None
         self._boot_ns = round(boot_s * SECOND_NS)
         self._noise_m = noise_m
-        self._baud_text = b" 57600" if leading_blank else b"57600"
+        self._baud = baud_bps
+        self._baud_text = (b" %d" if leading_blank else b"%d") % baud_bps
+        self._raw_pwm = raw_pwm
         self._random = np.random.default_rng(seed)
-        self._wire = PacedWire(BAUD)
+        self._wire = PacedWire(baud_bps)
         self._powered = False
         self._begin(0)
 
@@ -104,7 +110,7 @@ class ArduinoBridge:
         if not self._powered:
             self.power_on(now_ns)
         self._stop_when_forgotten(now_ns)
-        if baud is not None and baud != BAUD:
+        if baud is not None and baud != self._baud:
             return bytes(byte ^ 0x5A | 0x80 for byte in self._wire.leave_by(now_ns))
         if now_ns >= self._awake_ns:
             self._inbox += received
@@ -194,6 +200,8 @@ class ArduinoBridge:
                 return b"%d" % round(self._servo(first, now_ns)), 0
             case "e" | "r" | "m" | "u" if self.wheels:
                 return self._run_base(chr(self._letter), first, second, now_ns), 0
+            case "o" if self.wheels and self._raw_pwm:
+                self._drive(first / 255.0 * TOP_TURNS_PER_S, second / 255.0 * TOP_TURNS_PER_S, now_ns)
             case _:
                 return b"Invalid Command", 0
         return b"OK", 0
@@ -206,13 +214,17 @@ class ArduinoBridge:
             for wheel in self.wheels:
                 wheel.set_count(0, now_ns)
         elif letter == "m":
-            left.drive(now_ns, float(first * PID_HZ))
-            right.drive(now_ns, float(second * PID_HZ))
-            self._stop_ns = now_ns + AUTO_STOP_NS if first or second else None
+            per_s = PID_HZ / abs(left.ticks_per_turn), PID_HZ / abs(right.ticks_per_turn)
+            self._drive(first * per_s[0], second * per_s[1], now_ns)
         else:
             gains = [_atoi(part) for part in bytes(self._arguments[0]).split(b":") if part][:4]
             self.pid = (*gains, *self.pid[len(gains) :])  # type: ignore[assignment]
         return b"OK"
+
+    def _drive(self, left_turns_per_s: float, right_turns_per_s: float, now_ns: int) -> None:
+        for wheel, turns_per_s in zip(self.wheels, (left_turns_per_s, right_turns_per_s)):
+            wheel.drive(now_ns, turns_per_s * abs(wheel.ticks_per_turn))
+        self._stop_ns = now_ns + AUTO_STOP_NS if left_turns_per_s or right_turns_per_s else None
 
     def _stop_when_forgotten(self, now_ns: int) -> None:
         if self._stop_ns is not None and now_ns > self._stop_ns:
