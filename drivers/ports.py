@@ -43,6 +43,7 @@ class Direction(StrEnum):
     OUT = "out"  # item: what was sent, or SetBaudRate, at the time given to requests()
     CONNECTED = "connected"  # item: name of the source whose conversation was (re)started
     LOST = "lost"  # item: why the wire was given up
+    TURN = "turn"  # item: "": every conversation's requests() is called with this time, before what is then sent
 
 
 Tap = Callable[[Direction, int, "bytes | CanFrame | SetBaudRate | str"], None]

@@ -98,6 +98,7 @@ class WireReader(Generic[WireT]):
         self._clock = clock
         self._tap = tap
         self._stopping = threading.Event()
+        self._start_anew = threading.Event()
         self._wait = wait if wait is not None else self._stopping.wait
         self._lock = threading.RLock()  # held while a batch is worked on, never while waiting for one
         self._port: Port[WireT] | None = None
@@ -131,6 +132,10 @@ class WireReader(Generic[WireT]):
             log.error("%s: did not close within %.1f s and is left behind", self.name, deadline_s)
             return False
         return True
+
+    def start_anew(self) -> None:
+        """Begin every conversation from reset with the next turn, so that a recording has its set-up. Any thread."""
+        self._start_anew.set()
 
     def run(self) -> None:
         """The loop, until stop(). Called by the thread."""
@@ -168,11 +173,17 @@ class WireReader(Generic[WireT]):
             with self._lock:
                 self._hand_on(items)
                 now_ns = self._clock()
+                if self._tap is not None:
+                    self._tap(Direction.TURN, now_ns, "")
                 for source in self._sources:
                     self._send(port, source.requests(now_ns), now_ns)
                 self._forgive_own_pause()
                 for source in self._sources:
                     source.check(now_ns)
+                if self._start_anew.is_set():
+                    self._start_anew.clear()
+                    for source in self._sources:
+                        source.start_anew(now_ns)
         except PortError as error:
             self._give_up(str(error))
             return
@@ -422,6 +433,11 @@ class _Source(Generic[WireT]):
         """Silence: start anew, but no more often than the back-off allows: a device may come and go."""
         if now_ns >= self._restart_backoff.due_ns:
             self._restart_backoff.next(now_ns)
+            self._restart(now_ns)
+
+    def start_anew(self, now_ns: int) -> None:
+        """Begin from reset because somebody asked for it."""
+        if self._broken_until_ns is None:
             self._restart(now_ns)
 
     def _restart(self, now_ns: int) -> None:

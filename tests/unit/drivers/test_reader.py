@@ -436,13 +436,27 @@ def test_the_tap_hears_everything_in_order() -> None:
     bench.port.lost = "gone"
     bench.reader.step()
     assert heard[0] == (Direction.CONNECTED, 0, "front")
-    assert [(direction, item) for direction, _, item in heard[1:]] == [
+    assert [(direction, item) for direction, _, item in heard[1:] if direction is not Direction.TURN] == [
         (Direction.OUT, b"?"),
         (Direction.OUT, SetBaudRate(9600)),
         (Direction.IN, b"ab!"),
         (Direction.LOST, "gone"),
     ]
-    assert heard[1][1] in bench.talker.requested_at, "the time given to requests(), so that a replay can repeat it"
+    turns = [stamp_ns for direction, stamp_ns, _ in heard if direction is Direction.TURN]
+    assert turns == bench.talker.requested_at, "every time given to requests(), so that a replay can repeat it"
+    assert heard[1][0] is Direction.TURN
+
+
+def test_asked_to_start_anew_every_conversation_begins_from_reset() -> None:
+    heard: list[tuple[Direction, object]] = []
+    bench = Bench("front", "rear", tap=lambda direction, _stamp_ns, item: heard.append((direction, item)))
+    bench.run_until(40)
+    before = [item for direction, item in heard if direction is Direction.CONNECTED]
+    assert before == ["front", "rear"]
+    bench.reader.start_anew()
+    bench.run_until(200)
+    assert [item for direction, item in heard if direction is Direction.CONNECTED] == [*before, "front", "rear"]
+    assert bench.reader.health().openings == 1
 
 
 def test_close_says_farewell() -> None:
