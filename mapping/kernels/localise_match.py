@@ -306,9 +306,7 @@ def align(
                 c * dx + s * dy, c * dy - s * dx, pose[2] - ref[2], reach_m[level], scale_m[level], not last, sums,
             )  # fmt: skip
             add_turned(sums, ref[2], total)
-        weight = scale_m[level] * scale_m[level] / (scale_m[LEVELS - 1] * scale_m[LEVELS - 1])
-        if not last:
-            weight *= 0.25  # a quarter of the pairs
+        weight = 1.0 if last else 0.25  # coarse levels see a quarter of the pairs
         h[0, 0], h[0, 1], h[0, 2] = total[0], total[1], total[2]
         h[1, 0], h[1, 1], h[1, 2] = total[1], total[3], total[4]
         h[2, 0], h[2, 1], h[2, 2] = total[2], total[4], total[5]

@@ -76,6 +76,11 @@ class Match:
         """Partners for each point and reference, 0 to 1."""
         return self.partners / max(1, self.points * self.references)
 
+    @property
+    def score(self) -> float:
+        """How well all of it fits, 0 to 1: share of partners, each worth what it is not off."""
+        return self.share * (1.0 - self.mean_cost)
+
     def information(self) -> F64:
         """(3, 3) inverse covariance of the pose, as if one reference had been matched.
 

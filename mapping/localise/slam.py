@@ -42,7 +42,7 @@ from mapping.localise.closures import (
     turned_information,
 )
 from mapping.localise.pose_graph import Edges, composed_poses
-from mapping.localise.scan_match import Match, agreement, match_view
+from mapping.localise.scan_match import Match, Reach, agreement, match_view, weakest_information
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.views import BearingTable, View, ViewStore, table_for, view_of
 from mapping.scan import Scan
@@ -51,6 +51,11 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Progress = Callable[[int, int], None]
 
+NEARBY = Reach((0.30, 0.22, 0.18, 0.15), (0.08, 0.06, 0.05, 0.04))
+HELD_PER_M2 = 2500.0  # the worst direction of a match is sure to 2 cm: it can judge odometry
+LEAST_FIT = 0.3  # of a view's points must be explained, or it says nothing about where it was taken
+CLEARLY = 1.1  # times better a match must be to be believed against the prediction
+
 
 @dataclass(frozen=True, slots=True)
 class SlamSettings:
@@ -58,7 +63,9 @@ class SlamSettings:
 
     key_m, key_rad: a key scan so often.  references: how many key scans a sweep is laid on, the newest within near_m.
     farthest_m: longer readings are not matched.  odometry_*: standard deviation of a step by odometry: a constant, a
-    share of the way and of the turn.  work_keys: new key scans that make a piece of work.  lag_s, lag_s_per_key: see
+    share of the way and of the turn, all times a factor that is learned from how well odometry agrees with what is
+    matched, odometry_factor at first.  gate: a match so many deviations off the prediction must prove that it fits
+    better.  work_keys: new key scans that make a piece of work.  lag_s, lag_s_per_key: see
     the module's text.
     """
 
@@ -67,12 +74,14 @@ class SlamSettings:
     references: int = 12
     near_m: float = 6.0
     farthest_m: float = 30.0
-    odometry_m: float = 0.01
-    odometry_share: float = 0.10
+    odometry_m: float = 0.004
+    odometry_share: float = 0.04
     odometry_m_per_rad: float = 0.05
-    odometry_rad: float = math.radians(0.5)
-    odometry_turn_share: float = 0.15
-    odometry_rad_per_m: float = math.radians(1.0)
+    odometry_rad: float = math.radians(0.2)
+    odometry_turn_share: float = 0.05
+    odometry_rad_per_m: float = math.radians(0.5)
+    odometry_factor: float = 8.0
+    gate: float = 6.0
     floor_m: float = 0.008
     floor_rad: float = math.radians(0.1)
     least_points: int = 12
@@ -114,10 +123,56 @@ class _Sensor:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """A predicted pose of the sensor in the map and its information (3, 3)."""
+    """A predicted pose in the map, its standard deviations, and whether odometry says so."""
 
     map_from_sensor: Pose2
-    information: F64
+    map_from_base: Pose2
+    sigma_m: float
+    sigma_rad: float
+    by_odometry: bool
+
+    def information(self) -> F64:
+        """(3, 3) of x, y, yaw."""
+        return np.diag([self.sigma_m**-2.0, self.sigma_m**-2.0, self.sigma_rad**-2.0])
+
+    def deviations(self, pose: Pose2) -> tuple[float, float]:
+        """How far another pose is off, in standard deviations: translation, rotation."""
+        off = self.map_from_sensor.inverse() @ pose
+        return math.hypot(off.x_m, off.y_m) / self.sigma_m, abs(off.yaw_rad) / self.sigma_rad
+
+
+class _Trust:
+    """How much worse odometry is than its model says: running root mean squares, translation and rotation.
+
+    Only steps that move teach, and none by more than five times what was believed: one slip is no character.
+    """
+
+    LEARN = 0.03
+    MOST = 5.0
+    LEAST = 3.0  # odometry errs in one direction for long, so it must not pull where a match holds
+    LARGEST = 50.0
+
+    def __init__(self, factor: float) -> None:
+        self._square_m = self._square_rad = factor * factor
+
+    @property
+    def factor_m(self) -> float:
+        """For translations."""
+        return math.sqrt(self._square_m)
+
+    @property
+    def factor_rad(self) -> float:
+        """For rotations."""
+        return math.sqrt(self._square_rad)
+
+    def learn(self, off_m: float, off_rad: float) -> None:
+        """A step was so many (trusted) deviations off."""
+        self._square_m = self._after(self._square_m, off_m)
+        self._square_rad = self._after(self._square_rad, off_rad)
+
+    def _after(self, square: float, off: float) -> float:
+        grown = square * (1.0 + self.LEARN * (min(off, self.MOST) ** 2 - 1.0))
+        return min(max(grown, self.LEAST**2), self.LARGEST**2)
 
 
 class Slam:
@@ -143,6 +198,7 @@ class Slam:
         self._scan_in_key: list[tuple[float, float, float]] = []  # base pose in the key scan's sensor frame
         self._last: tuple[int, Pose2, Pose2 | None] | None = None  # stamp, map_from_base, odom_from_base
         self._velocity: F64 = np.zeros(3)
+        self._trust = _Trust(self.settings.odometry_factor)
         self._lost_scans = 0
         self._key_odom: Pose2 | None = None  # of the sensor, at the newest key scan
         self._key_covariance: F64 = np.zeros((3, 3))
@@ -168,7 +224,7 @@ class Slam:
         view = self._view(scan, sensor)
         guess = self._predicted(scan.stamp_ns, base_from_sensor, odom_from_base)
         if view is None:
-            return self._told_only(scan.stamp_ns, guess.map_from_sensor @ base_from_sensor.inverse(), odom_from_base)
+            return self._told_only(scan.stamp_ns, guess.map_from_base, odom_from_base)
         if not len(self._views):
             self._keep(scan.stamp_ns, sensor, view, guess.map_from_sensor, base_from_sensor, odom_from_base, None)
             return self._told(scan.stamp_ns, guess.map_from_sensor, base_from_sensor, odom_from_base, None, True)
@@ -197,24 +253,27 @@ class Slam:
 
     def _predicted(self, stamp_ns: int, base_from_sensor: Pose2, odom_from_base: Pose2 | None) -> _Place:
         """Where the sensor should be: by odometry since the last scan, else by the motion so far."""
-        s = self.settings
         if self._last is None:
             start = self._start or odom_from_base or IDENTITY
-            return _Place(start @ base_from_sensor, np.zeros((3, 3)))
+            return _Place(start @ base_from_sensor, start, 1.0, 1.0, False)
         last_ns, last_pose, last_odom = self._last
         if odom_from_base is not None and last_odom is not None:
             step = last_odom.inverse() @ odom_from_base
-            way, turn = math.hypot(step.x_m, step.y_m), abs(step.yaw_rad)
-            sigma_m = s.odometry_m + s.odometry_share * way + s.odometry_m_per_rad * turn
-            sigma_rad = s.odometry_rad + s.odometry_turn_share * turn + s.odometry_rad_per_m * way
-        else:
-            seconds = min(max((stamp_ns - last_ns) * 1e-9, 0.0), 0.5)
-            vx, vy, w = (float(v) for v in self._velocity * seconds)
-            step = Pose2(vx, vy, w)
-            sigma_m = 0.05 + 2.0 * seconds**2 + 0.3 * math.hypot(vx, vy)
-            sigma_rad = math.radians(3.0) + 3.0 * seconds**2 + 0.3 * abs(w)
-        information = np.diag([1.0 / sigma_m**2, 1.0 / sigma_m**2, 1.0 / sigma_rad**2])
-        return _Place(last_pose @ step @ base_from_sensor, information)
+            sigma_m, sigma_rad = self._odometry_sigma(math.hypot(step.x_m, step.y_m), abs(step.yaw_rad))
+            return _Place(last_pose @ step @ base_from_sensor, last_pose @ step, sigma_m, sigma_rad, True)
+        seconds = min(max((stamp_ns - last_ns) * 1e-9, 0.0), 0.5)
+        vx, vy, w = (float(v) for v in self._velocity * seconds)
+        sigma_m = 0.05 + 2.0 * seconds**2 + 0.3 * math.hypot(vx, vy)
+        sigma_rad = math.radians(3.0) + 3.0 * seconds**2 + 0.3 * abs(w)
+        ahead = last_pose @ Pose2(vx, vy, w)
+        return _Place(ahead @ base_from_sensor, ahead, sigma_m, sigma_rad, False)
+
+    def _odometry_sigma(self, way_m: float, turn_rad: float) -> tuple[float, float]:
+        """Standard deviations of a step by odometry, as far as it is trusted by now."""
+        s = self.settings
+        sigma_m = s.odometry_m + s.odometry_share * way_m + s.odometry_m_per_rad * turn_rad
+        sigma_rad = s.odometry_rad + s.odometry_turn_share * turn_rad + s.odometry_rad_per_m * way_m
+        return sigma_m * self._trust.factor_m, sigma_rad * self._trust.factor_rad
 
     def _references(self, near: Pose2) -> I64:
         """The newest key scans that are not far away."""
@@ -225,31 +284,68 @@ class Slam:
         return close if len(close) else rows[-1:]
 
     def _matched(self, view: View, guess: _Place) -> Match | None:
-        """The view laid on the references; where that fails, after looking around; None if nothing fits."""
+        """The view laid on the references by itself; where that is doubtful, the best of what else fits; None if
+        nothing does. A prediction that pulled all the time would pull into its own errors, which are no noise."""
         rows = self._references(guess.map_from_sensor)
         store, poses = self._views.arrays(), self._poses[rows]
-        match = match_view(view, store, rows, poses, guess.map_from_sensor, prior=guess.information)
-        if match is not None and match.share > 0.25 and match.mean_cost < 0.45:
-            self._lost_scans = 0
-            return match
-        self.events["looked_around"] += 1
-        fits = 0.0 if match is None else agreement(view, store, rows, poses, match.pose).explained
-        window_m = min(3.0, 0.6 + 0.2 * self._lost_scans)
-        found = find_view(
-            view, raster_of(store, rows, poses), guess.map_from_sensor, window_m=window_m, turn_rad=math.radians(25.0)
-        )
-        if found is not None:
-            other = match_view(view, store, rows, poses, found.pose)
-            if other is not None:
-                other_fits = agreement(view, store, rows, poses, other.pose).explained
-                if other_fits > fits + 0.1:
-                    match, fits = other, other_fits
-        if match is None or fits < 0.3:
+        match = match_view(view, store, rows, poses, guess.map_from_sensor, prior=0.01 * guess.information())
+        if match is None or not self._is_plain(match, guess):
+            self.events["looked_twice"] += 1
+            match = self._best_of(view, rows, guess, match)
+        if match is None:
             self.events["not_matched"] += 1
             self._lost_scans += 1
             return None
         self._lost_scans = 0
+        self._learn(match, guess)
         return match
+
+    def _is_plain(self, match: Match, guess: _Place) -> bool:
+        """Whether a match needs no second look: it is held in every direction, and it lies where it was expected."""
+        return (
+            match.share > 0.2
+            and match.mean_cost < 0.45
+            and weakest_information(match.information()) > HELD_PER_M2
+            and max(guess.deviations(match.pose)) < self.settings.gate
+        )
+
+    def _learn(self, match: Match, guess: _Place) -> None:
+        """What a step that was matched well, by itself, says about odometry."""
+        if not guess.by_odometry or self._last is None or weakest_information(match.information()) < HELD_PER_M2:
+            return
+        step = self._last[1].inverse() @ guess.map_from_base
+        if math.hypot(step.x_m, step.y_m) > 0.01 or abs(step.yaw_rad) > math.radians(0.5):
+            off_m, off_rad = guess.deviations(match.pose)
+            self._trust.learn(off_m / math.sqrt(2.0), off_rad)
+
+    def _best_of(self, view: View, rows: I64, guess: _Place, match: Match | None) -> Match | None:
+        """Of a free match, one that the prediction holds, and one searched for: what lies nearer to the prediction,
+        unless another is clearly better."""
+        store, poses = self._views.arrays(), self._poses[rows]
+        held = match_view(view, store, rows, poses, guess.map_from_sensor, prior=guess.information(), reach=NEARBY)
+        best = match if held is None or (match is not None and match.score > CLEARLY * held.score) else held
+        fits = 0.0 if best is None else agreement(view, store, rows, poses, best.pose).explained
+        if fits < 0.5:
+            best, fits = self._looked_around(view, rows, guess, best, fits)
+        return best if fits >= LEAST_FIT else None
+
+    def _looked_around(
+        self, view: View, rows: I64, guess: _Place, best: Match | None, fits: float
+    ) -> tuple[Match | None, float]:
+        """A place searched for within what the prediction may be off, if it explains more of the view."""
+        self.events["looked_around"] += 1
+        store, poses = self._views.arrays(), self._poses[rows]
+        window_m = min(1.0 + 0.2 * self._lost_scans, 3.0, 0.3 + self.settings.gate * guess.sigma_m)
+        turn_rad = min(math.radians(30.0), math.radians(2.0) + self.settings.gate * guess.sigma_rad)
+        raster = raster_of(store, rows, poses)
+        spot = find_view(view, raster, guess.map_from_sensor, window_m=window_m, turn_rad=turn_rad)
+        if spot is None or spot.rival > 0.97:
+            return best, fits
+        other = match_view(view, store, rows, poses, spot.pose, reach=NEARBY)
+        if other is None:
+            return best, fits
+        found = agreement(view, store, rows, poses, other.pose).explained
+        return (other, found) if found > fits + 0.1 else (best, fits)
 
     def _is_new_ground(self, sensor: str, pose: Pose2) -> bool:
         last = self._sensors[sensor].last_key
@@ -291,10 +387,10 @@ class Slam:
         """Of a key scan's pose seen from the one before: what the match holds, and what odometry holds."""
         s = self.settings
         way, turn = math.hypot(measured.x_m, measured.y_m), abs(measured.yaw_rad)
-        has_odometry = odom is not None and self._key_odom is not None
-        share, constant = (s.odometry_share, s.odometry_m) if has_odometry else (0.5, 0.10)
-        sigma_m = constant + share * way + s.odometry_m_per_rad * turn
-        sigma_rad = (s.odometry_rad if has_odometry else math.radians(5.0)) + s.odometry_turn_share * turn
+        if odom is not None and self._key_odom is not None:
+            sigma_m, sigma_rad = self._odometry_sigma(way, turn)
+        else:
+            sigma_m, sigma_rad = 0.1 + 0.5 * way, math.radians(5.0) + 0.3 * turn
         information = np.diag([1.0 / sigma_m**2, 1.0 / sigma_m**2, 1.0 / sigma_rad**2])
         if match is not None:
             information = information + turned_information(match.information(), -before.yaw_rad)
