@@ -216,7 +216,7 @@ def build(
     every: Annotated[int, typer.Option(min=1, help="Use every N-th scan.")] = 1,
     hold_out: Annotated[int, typer.Option(min=0, help="Keep every N-th scan back and judge the grid by it.")] = 0,
     resolution: Annotated[float, typer.Option(min=0.005, max=1.0, help="Metres a cell.")] = 0.05,
-    model: Annotated[Model, typer.Option(help="How cells count.")] = Model.COUNTERS,
+    model: Annotated[Model, typer.Option(help="How cells count.")] = Model.LOG_ODDS,
     as_json: AsJson = False,
 ) -> None:
     """Map a recorded log offline: trajectory, grid in every form, report.

@@ -21,8 +21,7 @@ class Robot {
     this.cones = new Map();
     this.polar = new Map();
     this.grid = new draw.GridImage();
-    this.pending = [];
-    this.framed = false;
+    this.seen = new Map(); // when a device's newest reading came here
   }
 
   addPose(pose) {
@@ -88,6 +87,7 @@ const HANDLERS = [
   [/^range\/([^/]+)$/, (robot, payload, _a, [name]) => robot.cones.set(name, json(payload))],
   [/^sectors\/polar\/([^/]+)$/, (robot, payload, _a, [name]) => robot.polar.set(name, json(payload))],
   [/^pose$/, (robot, payload) => robot.addPose(cdr.poseWithCovariance(payload))],
+  [/^odom$/, (robot) => { for (const s of robot.health?.sources ?? []) if (s.kind === "wheels") robot.seen.set(s.name, performance.now()); }],
   [/^map\/grid$/, (robot, payload, attachment) => robot.grid.full(cdr.occupancyGrid(payload), epochOf(attachment))],
   [/^map\/grid\/update$/, (robot, payload, attachment) => {
     if (epochOf(attachment) === robot.grid.epoch) robot.grid.update(cdr.occupancyGridUpdate(payload));
@@ -109,7 +109,12 @@ function take({ key, attachment, payload }) {
   const robot = robotOf(key), suffix = key.slice(robot.base.length + 1);
   for (const [pattern, handle] of HANDLERS) {
     const match = pattern.exec(suffix);
-    if (match) { handle(robot, payload, attachment, match.slice(1)); changed = true; return; }
+    if (match) {
+      handle(robot, payload, attachment, match.slice(1));
+      if (match.length > 1) robot.seen.set(match[1], performance.now());
+      changed = true;
+      return;
+    }
   }
 }
 
@@ -177,7 +182,13 @@ function ageClass(age, rate) {
   return age <= Math.max(3 * period, 0.3) ? "age-fresh" : age < 2 ? "age-late" : "age-old";
 }
 
-function card(source, extraAge) {
+// Health comes once a second; a reading that came here since then is the better witness.
+function ageNow(robot, source) {
+  const told = source.age_s === null ? Infinity : source.age_s + (performance.now() - robot.healthAt) / 1000;
+  return Math.min(told, (performance.now() - (robot.seen.get(source.name) ?? -Infinity)) / 1000);
+}
+
+function card(source, age) {
   const box = element("article", "", { className: "card" });
   box.dataset.level = LEVELS.indexOf(source.level);
   const title = element("h2", source.name);
@@ -185,7 +196,6 @@ function card(source, extraAge) {
   box.append(title);
   box.append(element("p", source.text || source.state));
   if (source.identity) box.append(element("p", source.identity, { className: "who" }));
-  const age = source.age_s === null ? NaN : source.age_s + extraAge;
   const list = element("dl");
   figure(list, "rate", number(source.rate_hz, 1, "Hz"));
   figure(list, "age", Number.isFinite(age) ? (age < 10 ? `${(age * 1000).toFixed(0)} ms` : `${age.toFixed(0)} s`) : "never", ageClass(age, source.rate_hz));
@@ -198,8 +208,7 @@ function card(source, extraAge) {
 
 function drawPanel(robot) {
   const sources = robot?.health?.sources ?? [];
-  const extraAge = robot?.healthAt ? (performance.now() - robot.healthAt) / 1000 : 0;
-  $("devices").replaceChildren(...sources.map((source) => card(source, extraAge)));
+  $("devices").replaceChildren(...sources.map((source) => card(source, ageNow(robot, source))));
   const maps = [...(robot?.polar.keys() ?? [])].sort();
   const cards = [];
   if (maps.length) {
@@ -265,7 +274,7 @@ function drawMap(robot) {
   const g2 = draw.prepare($("map"));
   draw.clearMap(g2, camera);
   if (!robot) return;
-  if (!robot.framed) frameWhenKnown(robot);
+  frameWhenKnown(robot);
   if (follow && robot.pose) { camera.x = robot.pose.x; camera.y = robot.pose.y; }
   if (layers.grid) robot.grid.draw(g2, camera);
   if (layers.trail) draw.drawTrail(g2, camera, robot.trail);

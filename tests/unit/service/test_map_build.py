@@ -1,0 +1,118 @@
+"""A log becomes a map: a log written here of a room whose walls are known, and recorded ones."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.errors import WrongUsage
+from service.export import load_pgm_yaml
+from service.map_build import Built, PoseSource, build, write
+
+DATA = os.environ.get("UMFELD_DATA", "")
+needs_data = pytest.mark.skipif(not DATA, reason="needs UMFELD_DATA")
+HALF_M = 3.0
+MAX_M = 81.83
+
+
+def flaser(x: float, y: float, yaw: float, stamp: float) -> str:
+    """A CARMEN line: 181 beams from the right to the left of a laser in a square room with a gap to the east."""
+    ranges = []
+    for k in range(181):
+        angle = yaw + math.radians(k - 90.0)
+        c, s = math.cos(angle), math.sin(angle)
+        ways = [((math.copysign(HALF_M, d) - p) / d, axis) for axis, (p, d) in enumerate(((x, c), (y, s))) if d]
+        reach, axis = min(ways)
+        out = axis == 0 and c > 0 and abs(y + reach * s) < 0.5
+        ranges.append(MAX_M if out else reach)
+    beams = " ".join(f"{r:.3f}" for r in ranges)
+    return f"FLASER 181 {beams} {x} {y} {yaw} {x} {y} {yaw} {stamp:.6f} host {stamp:.6f}\n"
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    path = tmp_path / "room.clf"
+    way = [(-1.0 + 0.05 * k, 0.3 * math.sin(0.2 * k), 0.3 * k) for k in range(60)]
+    path.write_text("# a log\n" + "".join(flaser(*pose, 100.0 + 0.2 * k) for k, pose in enumerate(way)))
+    return path
+
+
+def test_the_walls_are_where_they_are_and_every_file_is_written(room: Path, tmp_path: Path) -> None:
+    built = build(room, poses=PoseSource.LOG, hold_out=10)
+    report = write(built, tmp_path / "out", source=PoseSource.LOG)
+    image = load_pgm_yaml(tmp_path / "out" / "map.yaml")
+    rows, cols = np.nonzero(image.cells == 100)
+    x, y = image.origin.x_m + (cols + 0.5) * 0.05, image.origin.y_m + (rows + 0.5) * 0.05
+    off = np.abs(np.maximum(np.abs(x), np.abs(y)) - HALF_M)
+    assert off.max() < 0.08  # a cell's half diagonal, and the millimetres of the log
+    assert len(off) > 350  # four walls of 120 cells, less what the gap and the corners cost
+    for name in ("trajectory.tum", "map.pgm", "map.yaml", "map.png", "map.umfeld", "report.json"):
+        assert (tmp_path / "out" / name).stat().st_size > 0
+    assert json.loads((tmp_path / "out" / "report.json").read_text()) == json.loads(json.dumps(report))
+    assert built.hold_out is not None
+    assert built.hold_out.near_occupied > 0.99
+    assert built.hold_out.crossing_early < 0.01
+    assert report["inserted"] == 54
+
+
+def test_no_echo_frees_nothing_behind_the_gap(room: Path) -> None:
+    built = build(room, poses=PoseSource.LOG)
+    assert built.grid.state_at([[HALF_M + 1.0, 0.0]])[0] == -1
+
+
+def test_the_trajectory_has_a_line_a_scan_in_the_form_of_tum(room: Path, tmp_path: Path) -> None:
+    built = build(room, poses=PoseSource.ODOMETRY, every=2)
+    write(built, tmp_path, source=PoseSource.ODOMETRY)
+    rows = np.loadtxt(tmp_path / "trajectory.tum")
+    assert rows.shape == (30, 8)
+    assert np.allclose(rows[:, 0], 100.0 + 0.4 * np.arange(30))
+    assert np.allclose(np.hypot(rows[:, 6], rows[:, 7]), 1.0)
+    assert np.allclose(2.0 * np.arctan2(rows[3, 6], rows[3, 7]), 0.3 * 6)
+
+
+def test_the_same_log_gives_the_same_files(room: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write(build(room, poses=PoseSource.LOG), tmp_path / name, source=PoseSource.LOG)
+    for name in ("trajectory.tum", "map.pgm", "map.yaml", "map.png"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+@pytest.mark.parametrize("content", ["", "no log at all\n", "PARAM robot_x 1 nohost 0\n", "\x00\x01\x02" * 50])
+def test_what_is_no_log_is_said_so(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.clf"
+    path.write_text(content)
+    with pytest.raises(WrongUsage, match=r"bad\.clf"):
+        build(path, poses=PoseSource.LOG)
+
+
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(WrongUsage, match="nowhere"):
+        build(tmp_path / "nowhere.clf", poses=PoseSource.LOG)
+
+
+def recorded(name: str) -> Built:
+    return build(Path(DATA) / "known_pose_logs" / f"{name}-corrected.log.gz", poses=PoseSource.LOG, hold_out=10)
+
+
+@pytest.mark.data
+@needs_data
+@pytest.mark.parametrize(("name", "near", "early"), [("belgioioso", 0.96, 0.08), ("seattle", 0.96, 0.06)])
+def test_scans_that_were_held_back_fit_a_grid_of_corrected_poses(name: str, near: float, early: float) -> None:
+    """The poses of these logs scatter by some 5 cm, so beams along a wall do cross its front cells."""
+    judged = recorded(name).hold_out
+    assert judged is not None
+    assert judged.near_occupied >= near
+    assert judged.crossing_early <= early
+
+
+@pytest.mark.data
+@needs_data
+def test_corrected_poses_are_not_sold_as_odometry() -> None:
+    path = Path(DATA) / "known_pose_logs" / "seattle-corrected.log.gz"
+    with pytest.raises(WrongUsage, match="--poses log"):
+        build(path, poses=PoseSource.ODOMETRY)
