@@ -7,15 +7,25 @@
     laser:lost_sector(from_deg=-30, to_deg=10)
     sonar.left:stuck=0.8(channel=3)       sonar:stall hits sonar.left and sonar.right
     bus:flood=2000@4s..6s                 frames a second
+    laser:drop=0.1(to_device=1)           of what the host sends, not of what the device says
+    bumper.front:stuck_on                 a switch that stays closed
+
+A CAN bus as a whole (bus.NAME) can be unplugged (the hosts' adapters are pulled out), be silent or held up (nothing
+crosses it), lose its supply (its nodes go dark and start again) and spoil frames; what befalls the serial port of the
+daemon's adapter (rename, busy, bytes lost) is written as adapter.NAME. A board that counts both wheels takes side=1
+(left) or side=2 (right) in the faults of wheels.
 
 Times count from the first step of any device of the plan. A `FaultPlan` hands out wrappers; each looks up what is
 active for its name. What is wrapped does not know:
 
     plan.scene("laser", scene)      what the device measures         plan.node("sonar.left", node)   a CAN node
     plan.device("laser", laser)     a serial or TCP device           plan.bus("bus", bus)            a whole CAN bus
+    plan.contact("bumper", switch)  a bumper or cliff switch
 
 A host's slcan adapter is a serial device too: station.wrap_member(name, plan.device("can.daemon", adapter)).
-`KINDS` lists all kinds. Faults may be started and ended while everything runs, in the loop's thread (Attachment.post).
+`KINDS` lists all kinds. A device that carries faults out inside itself has `fault_family` and `inflict` (wheel.Faulty);
+lasers may have set_speed_share, set_clock_drift, trouble and points_left_out. Faults may be started and ended while
+everything runs, in the loop's thread (Attachment.post).
 """
 
 from __future__ import annotations
@@ -30,11 +40,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_devices.contact import Contact, floor_under
 from sim_devices.device import F64, ByteDevice, CanDevice, Frame, Mount, Scene
 from sim_devices.encoder_cia406 import Cia406Encoder
-from sim_devices.laser_hokuyo import HokuyoLaser
 from sim_devices.slcan_hub import CanBus
 from sim_devices.sonar_usboard import UsBoard, UsBoardCan, UsBoardSerial
+from sim_devices.wheel import DrivenScene, Faulty, Side, Undo
 from sim_devices.wire import SECOND_NS
 
 FOREVER_NS = 1 << 62
@@ -67,9 +78,9 @@ KINDS: dict[str, Kind] = {
     "single_bytes": Kind("wire", "bytes arrive one at a time, so many a second", 20_000),
     "short_reads": Kind("wire", "bytes arrive in pieces of 1 to this many", 7),
     "bursts": Kind("wire", "bytes arrive at intervals of this many seconds", 0.2),
-    "drop": Kind("any", "share of bytes (frames, on a bus) lost", 0.01),
-    "add": Kind("any", "share of bytes (frames, on a bus) followed by one too many", 0.01),
-    "flip": Kind("any", "share of bytes (frames, on a bus) with one bit turned", 0.01),
+    "drop": Kind("any", "share of bytes (frames, on a bus) lost; to_device=1: of those the host sends", 0.01),
+    "add": Kind("any", "share of bytes (frames, on a bus) followed by one too many; to_device=1 as above", 0.01),
+    "flip": Kind("any", "share of bytes (frames, on a bus) with one bit turned; to_device=1 as above", 0.01),
     "wrong_baud": Kind("wire", "the device runs at another line rate"),
     "flood": Kind("any", "so many bytes (frames, on a bus) of nonsense a second", 2000),
     "delay": Kind("any", "everything arrives so many seconds late", 0.1),
@@ -89,6 +100,8 @@ KINDS: dict[str, Kind] = {
     "slow_blinding": Kind("beams", "seconds until all beams are blind; more and more are", 20.0),
     "clock_drift": Kind("laser", "the device's clock runs so many ppm fast", 500.0),
     "speed": Kind("laser", "the head turns at this share of its speed", 0.95),
+    "varying_speed": Kind("laser", "the head's speed swings by this share to both sides, every `period_s` (4)", 0.1),
+    "varying_count": Kind("points", "share of the points of each turn, at random, that the laser leaves out", 0.1),
     "trouble": Kind("laser", "hardware trouble under this status (50 to 97)", 51),
     # what sonars meet
     "stuck": Kind("sonar", "`channel` (all, if none) always reads this many metres", 0.5),
@@ -105,7 +118,11 @@ KINDS: dict[str, Kind] = {
     "missed_counts": Kind("wheels", "share of the steps not counted", 0.05),
     "slip": Kind("wheels", "the wheel turns by this share more than the robot moves", 0.2),
     "size_change": Kind("wheels", "the wheel has this share of its size", 0.95),
-    "alarm": Kind("encoder", "the node reports an internal fault (this emergency code)", 0x1000),
+    "alarm": Kind("encoder", "the node reports an internal fault (this emergency or status code)", 0x1000),
+    # what switches meet
+    "bounce": Kind("switch", "the contact chatters for so many seconds whenever it closes or opens", 0.05),
+    "stuck_on": Kind("switch", "the contact stays closed: pressed, or no floor"),
+    "stuck_off": Kind("switch", "the contact never closes"),
 }
 
 
@@ -291,6 +308,8 @@ class FaultPlan:
                 found.append(f"{fault.target}:{fault.kind}: there is no device {fault.target!r}{hint}")
             elif not any(KINDS[fault.kind].hits in what for what in carried):
                 hint = f"it hits {KINDS[fault.kind].hits}, this has {', '.join(sorted(set().union(*carried)))}"
+                if KINDS[fault.kind].hits == "wire" and any("bus" in what for what in carried):
+                    hint = f"the serial port of its adapter is adapter{fault.target.removeprefix('bus')}"
                 found.append(f"{fault.target}:{fault.kind}: {fault.target!r} cannot have this fault; {hint}")
         return found
 
@@ -307,18 +326,25 @@ class FaultPlan:
 
     def device(self, target: str, device: ByteDevice) -> FaultyByteDevice:
         """A serial or TCP device with its faults."""
-        self._carries(target, "any", "wire", _family(device))
+        self._carries(target, "any", "wire", *_families(device))
         return FaultyByteDevice(device, self, target)
 
     def node(self, target: str, node: CanDevice) -> FaultyNode:
         """A CAN node with its faults."""
-        self._carries(target, "any", _family(node))
+        self._carries(target, "any", *_families(node))
         return FaultyNode(node, self, target)
 
     def bus(self, target: str, bus: CanBus) -> None:
-        """Faults of a whole CAN bus: a trouble-maker joins it as a node."""
+        """Faults of a whole CAN bus: a trouble-maker joins it as a node, and stands between all others."""
         self._carries(target, "any", "bus")
-        bus.add_node(f"{target} faults", BusTrouble(bus, self, target))
+        trouble = BusTrouble(bus, self, target)
+        bus.add_node(f"{target} faults", trouble)
+        bus.disturbance = trouble
+
+    def contact(self, target: str, contact: Contact) -> FaultyContact:
+        """A switch with its faults."""
+        self._carries(target, "switch")
+        return FaultyContact(contact, self, target)
 
     def _carries(self, target: str, *what: str) -> None:
         self._targets.setdefault(target, set()).update(what)
@@ -375,8 +401,19 @@ class FaultyScene:
             begin_ns = now_ns - at_ns + fault.start_ns
             until_ns = now_ns - at_ns + min(at_ns, fault.end_ns)
             rolled = np.array(self._scene.wheel_travel_m(until_ns)) - np.array(self._scene.wheel_travel_m(begin_ns))
-            seen += _extra_roll(fault, rolled)
+            extra = _extra_roll(fault, rolled)
+            side = round(fault.argument("side", 0))
+            seen += extra if side not in (1, 2) else np.where(np.arange(2) == side - 1, extra, 0.0)
         return float(seen[0]), float(seen[1])
+
+    def drive_wheel(self, now_ns: int, side: Side, speed_m_s: float) -> None:
+        """Motors turn what is really there."""
+        if isinstance(self._scene, DrivenScene):
+            self._scene.drive_wheel(now_ns, side, speed_m_s)
+
+    def floor_m(self, mount: Mount, now_ns: int) -> float:
+        """See contact.GroundScene."""
+        return floor_under(self._scene, mount, now_ns)
 
 
 def _extra_roll(fault: Fault, rolled: F64) -> F64:
@@ -482,16 +519,19 @@ BEAM_FAULTS: dict[str, Callable[[F64, Fault, Sight], F64]] = {
 # -- devices ----------------------------------------------------------------------------------------------------------
 
 
-Undo = Callable[[int], object]  # told the time
+SWING_STEP_NS = 100_000_000  # between two speeds of a head whose speed swings
 
 
-def _family(device: object) -> str:
+def _families(device: object) -> list[str]:
     """Which of the kinds' families a device belongs to."""
-    if isinstance(device, HokuyoLaser):
-        return "laser"
+    found = ["points"] if hasattr(device, "points_left_out") else []
+    if isinstance(device, Faulty):
+        found.append(device.fault_family)
+    if hasattr(device, "set_speed_share"):
+        found.append("laser")
     if isinstance(device, UsBoardCan | UsBoardSerial):
-        return "sonar"
-    return "encoder" if isinstance(device, Cia406Encoder) else "any"
+        found.append("sonar")
+    return [*found, "encoder"] if isinstance(device, Cia406Encoder) else found
 
 
 class _Knobs:
@@ -504,6 +544,7 @@ class _Knobs:
         self._undo: dict[int, Undo] = {}
         self._faults: list[Fault] = []
         self.frames: list[Frame] = []
+        self._swing_ns: int | None = None
         if isinstance(device, UsBoardCan | UsBoardSerial):
             plan.boards.append(device.board)
 
@@ -517,10 +558,31 @@ class _Knobs:
             if not any(fault is other for other in self._faults) and (undo := self._turn(fault, now_ns)) is not None:
                 self._undo[id(fault)] = undo
         self._faults = active
+        self._swing(active, now_ns)
         return active
 
+    @property
+    def next_ns(self) -> int | None:
+        """When it must turn something again."""
+        return self._swing_ns
+
+    def _swing(self, active: Sequence[Fault], now_ns: int) -> None:
+        """A head whose speed swings gets another speed now and then."""
+        swinging = next((fault for fault in active if fault.kind == "varying_speed"), None)
+        if swinging is None:
+            self._swing_ns = None
+        elif self._swing_ns is None or now_ns >= self._swing_ns:
+            since_s = (self._plan.now_ns(now_ns) - swinging.start_ns) / SECOND_NS
+            share = 1.0 + swinging.value * math.sin(2.0 * math.pi * since_s / swinging.argument("period_s", 4.0))
+            _call(self._device, "set_speed_share", share, now_ns)
+            self._swing_ns = now_ns + SWING_STEP_NS
+
     def _turn(self, fault: Fault, now_ns: int) -> Undo | None:
-        if isinstance(self._device, HokuyoLaser):
+        if fault.kind == "varying_count" and hasattr(self._device, "points_left_out"):
+            return _set(self._device, "points_left_out", fault.value)
+        if isinstance(self._device, Faulty):
+            return self._device.inflict(fault.kind, fault.value, fault.arguments, now_ns)
+        if hasattr(self._device, "set_speed_share"):
             return _turn_laser(self._device, fault, now_ns)
         if isinstance(self._device, UsBoardCan | UsBoardSerial):
             return _turn_board(self._device.board, fault, self._plan.boards)
@@ -540,18 +602,26 @@ class _Knobs:
         return None
 
 
-def _turn_laser(laser: HokuyoLaser, fault: Fault, now_ns: int) -> Undo | None:
+def _turn_laser(laser: object, fault: Fault, now_ns: int) -> Undo | None:
     if fault.kind == "clock_drift":
-        before_ppm = laser.clock_drift_ppm
-        laser.set_clock_drift(fault.value, now_ns)
-        return lambda then_ns: laser.set_clock_drift(before_ppm, then_ns)
+        before_ppm = getattr(laser, "clock_drift_ppm", 0.0)
+        _call(laser, "set_clock_drift", fault.value, now_ns)
+        return lambda then_ns: _call(laser, "set_clock_drift", before_ppm, then_ns)
     if fault.kind == "speed":
-        laser.set_speed_share(fault.value, now_ns)
-        return lambda then_ns: laser.set_speed_share(1.0, then_ns)
+        _call(laser, "set_speed_share", fault.value, now_ns)
+    if fault.kind in ("speed", "varying_speed"):
+        return lambda then_ns: _call(laser, "set_speed_share", 1.0, then_ns)
     if fault.kind == "trouble":
-        laser.trouble(f"{round(fault.value):02d}", now_ns)
-        return lambda then_ns: laser.trouble(None, then_ns)
+        _call(laser, "trouble", f"{round(fault.value):02d}", now_ns)
+        return lambda then_ns: _call(laser, "trouble", None, then_ns)
     return None
+
+
+def _call(device: object, method: str, *arguments: object) -> None:
+    """Call a method that not every device of the family has."""
+    wanted = getattr(device, method, None)
+    if wanted is not None:
+        wanted(*arguments)
 
 
 def _turn_board(board: UsBoard, fault: Fault, boards: Sequence[UsBoard]) -> Undo | None:
@@ -604,10 +674,12 @@ class FaultyByteDevice:
     def step(self, now_ns: int, received: bytes, baud: int | None = None) -> bytes:
         """Step the device and carry out what its faults do to the bytes."""
         self._plan.begin(now_ns)
-        faults = {fault.kind: fault for fault in reversed(self._knobs.follow(now_ns))}
+        faults, inward = _by_direction(self._knobs.follow(now_ns))
         elapsed_ns = 0 if self._now_ns is None else now_ns - self._now_ns
         self._now_ns = now_ns
         self._follow_port(faults)
+        if received and inward:
+            received = self._mangled(np.frombuffer(received, np.uint8), inward)
         if self._is_dark(faults, now_ns):
             return b""
         deaf = not self.plugged or "wrong_baud" in faults
@@ -622,7 +694,7 @@ class FaultyByteDevice:
     def next_ns(self) -> int | None:
         """When the device, the next change of its faults, or held-back bytes want to be served."""
         now_ns = self._now_ns or 0
-        due = [self._plan.next_change_ns(self._target, now_ns), self._dark_until_ns]
+        due = [self._plan.next_change_ns(self._target, now_ns), self._dark_until_ns, self._knobs.next_ns]
         if not self._was_off:
             due.append(getattr(self.inner, "next_ns", now_ns + STEP_NS))
         held = self._plan.active(self._target, "stall", now_ns) is not None
@@ -732,9 +804,11 @@ class FaultyNode:
     def step(self, now_ns: int, received: Sequence[Frame]) -> list[Frame]:
         """Step the node and carry out what its faults do to its frames."""
         self._plan.begin(now_ns)
-        faults = {fault.kind: fault for fault in reversed(self._knobs.follow(now_ns))}
+        faults, inward = _by_direction(self._knobs.follow(now_ns))
         elapsed_ns = 0 if self._now_ns is None else now_ns - self._now_ns
         self._now_ns = now_ns
+        if inward:
+            received = [copy for frame in received for copy in self._mangled(frame, inward)]
         if self._is_dark(faults, now_ns):
             return []
         cut = "unplug" in faults
@@ -749,11 +823,16 @@ class FaultyNode:
             out += [Frame(0x7EF, self._random.bytes(8))] * min(200, int(flood.value * elapsed_ns / SECOND_NS))
         return self._timed(out, faults, now_ns)
 
+    def power_on(self, now_ns: int) -> None:
+        """The supply of the whole bus came back."""
+        self._held.clear()
+        _switch_on(self.inner, now_ns)
+
     @property
     def next_ns(self) -> int | None:
         """When the node, the next change of its faults, or held-back frames want to be served."""
         now_ns = self._now_ns or 0
-        due = [self._plan.next_change_ns(self._target, now_ns), self._dark_until_ns]
+        due = [self._plan.next_change_ns(self._target, now_ns), self._dark_until_ns, self._knobs.next_ns]
         if not self._was_off:
             due.append(getattr(self.inner, "next_ns", now_ns + STEP_NS))
         due += [max(at_ns, now_ns + STEP_NS) for at_ns, _ in self._held[:1]]
@@ -782,15 +861,7 @@ class FaultyNode:
         return out[: len(out) // 2]
 
     def _mangled(self, frame: Frame, faults: Mapping[str, Fault]) -> list[Frame]:
-        if (drop := faults.get("drop")) is not None and self._random.random() < drop.value:
-            return []
-        if (flip := faults.get("flip")) is not None and frame.data and self._random.random() < flip.value:
-            data = bytearray(frame.data)
-            data[self._random.integers(len(data))] ^= 1 << int(self._random.integers(8))
-            frame = Frame(frame.can_id, bytes(data), frame.extended, frame.remote, frame.dlc)
-        if (add := faults.get("add")) is not None and self._random.random() < add.value:
-            return [frame, frame]
-        return [frame]
+        return _mangled_frame(frame, faults, self._random)
 
     def _timed(self, out: list[Frame], faults: Mapping[str, Fault], now_ns: int) -> list[Frame]:
         delay = faults.get("delay")
@@ -804,15 +875,63 @@ class FaultyNode:
 
 
 class BusTrouble:
-    """A node that disturbs a whole bus: floods it, sends under another's id, throws the adapters off it."""
+    """What befalls a whole bus: a node that floods it or sends under another's id, and a hand on its wires."""
 
     def __init__(self, bus: CanBus, plan: FaultPlan, target: str) -> None:
+        self.is_dark = False
         self._bus = bus
         self._plan = plan
         self._target = target
         self._random = plan.random(target)
         self._now_ns: int | None = None
         self._owed = 0.0
+        self._dark_until_ns: int | None = None
+        self._browned: list[Fault] = []
+        self._held: list[tuple[int, object, Frame]] = []
+
+    # -- between the nodes --------------------------------------------------------------------------------------------
+
+    def begin(self, now_ns: int) -> None:
+        """Before the nodes are stepped: plugs, supply and adapters as they are now."""
+        self._plan.begin(now_ns)
+        faults = self._active(now_ns)
+        for adapter in self._bus.adapters.values():
+            adapter.plugged = "unplug" not in faults
+            adapter.bus_off = adapter.bus_off or "bus_off" in faults
+        browned = faults.get("brown_out")
+        if browned is not None and not any(browned is done for done in self._browned):
+            self._browned.append(browned)
+            self._dark_until_ns = now_ns + round(browned.value * SECOND_NS)
+        if self._dark_until_ns is not None and now_ns >= self._dark_until_ns:
+            self._dark_until_ns = None
+        was_dark = self.is_dark
+        self.is_dark = self._dark_until_ns is not None or not faults.keys().isdisjoint(("power_cycle", "slow_boot"))
+        if self.is_dark:
+            self._held.clear()
+        elif was_dark:
+            for node in self._bus.nodes.values():
+                _switch_on(node, now_ns)
+
+    def carried(self, moved: Sequence[tuple[object, Frame]], now_ns: int) -> list[tuple[object, Frame]]:
+        """What of these frames (sender, frame) gets across now."""
+        faults = self._active(now_ns)
+        if not faults.keys().isdisjoint(("unplug", "silence")):
+            self._held.clear()
+            return []
+        delay = faults.get("delay")
+        at_ns = now_ns + (0 if delay is None else round(delay.value * SECOND_NS))
+        for sender, frame in moved:
+            self._held += [(at_ns, sender, copy) for copy in _mangled_frame(frame, faults, self._random)]
+        if "stall" in faults:
+            return []
+        ready = [(sender, frame) for due_ns, sender, frame in self._held if due_ns <= now_ns]
+        self._held = [item for item in self._held if item[0] > now_ns]
+        return ready
+
+    def _active(self, now_ns: int) -> dict[str, Fault]:
+        return {fault.kind: fault for fault in reversed(self._plan.all_active(self._target, now_ns))}
+
+    # -- as a node ----------------------------------------------------------------------------------------------------
 
     def step(self, now_ns: int, received: Sequence[Frame]) -> list[Frame]:
         """What the trouble-maker sends."""
@@ -820,9 +939,6 @@ class BusTrouble:
         out: list[Frame] = []
         elapsed_ns = 0 if self._now_ns is None else now_ns - self._now_ns
         self._now_ns = now_ns
-        if self._plan.active(self._target, "bus_off", now_ns):
-            for adapter in self._bus.adapters.values():
-                adapter.bus_off = True
         if (flood := self._plan.active(self._target, "flood", now_ns)) is not None:
             self._owed = min(1000.0, self._owed + flood.value * elapsed_ns / SECOND_NS)
             out += [Frame(round(flood.argument("id", 0x7EF)), self._random.bytes(8)) for _ in range(int(self._owed))]
@@ -834,11 +950,56 @@ class BusTrouble:
 
     @property
     def next_ns(self) -> int | None:
-        """Soon while it floods, else when a fault begins or ends."""
+        """Soon while it floods, else when a fault begins or ends or held-back frames are due."""
         now_ns = self._now_ns or 0
         if self._plan.active(self._target, "flood", now_ns):
             return now_ns + STEP_NS
-        return self._plan.next_change_ns(self._target, now_ns)
+        due = [self._plan.next_change_ns(self._target, now_ns), self._dark_until_ns]
+        due += [max(at_ns, now_ns + STEP_NS) for at_ns, _, _ in self._held[:1]]
+        return min((at_ns for at_ns in due if at_ns is not None), default=None)
+
+
+def _by_direction(faults: Sequence[Fault]) -> tuple[dict[str, Fault], dict[str, Fault]]:
+    """The first fault of each kind: of what the device says (and all that have no direction), of what it hears."""
+    inward = {fault.kind: fault for fault in reversed(faults) if fault.argument("to_device", 0.0)}
+    outward = {fault.kind: fault for fault in reversed(faults) if not fault.argument("to_device", 0.0)}
+    return outward, inward
+
+
+def _mangled_frame(frame: Frame, faults: Mapping[str, Fault], random: np.random.Generator) -> list[Frame]:
+    """What becomes of a frame: nothing, itself, with a bit turned, or twice itself."""
+    if (drop := faults.get("drop")) is not None and random.random() < drop.value:
+        return []
+    if (flip := faults.get("flip")) is not None and frame.data and random.random() < flip.value:
+        data = bytearray(frame.data)
+        data[random.integers(len(data))] ^= 1 << int(random.integers(8))
+        frame = Frame(frame.can_id, bytes(data), frame.extended, frame.remote, frame.dlc)
+    if (add := faults.get("add")) is not None and random.random() < add.value:
+        return [frame, frame]
+    return [frame]
+
+
+class FaultyContact:
+    """A switch seen through its faults."""
+
+    def __init__(self, contact: Contact, plan: FaultPlan, target: str) -> None:
+        self.inner = contact
+        self._knobs = _Knobs(contact, plan, target)
+        self._plan = plan
+
+    def is_closed(self, now_ns: int) -> bool:
+        """See Contact."""
+        self._follow(now_ns)
+        return self.inner.is_closed(now_ns)
+
+    def level(self, now_ns: int) -> bool:
+        """See Contact."""
+        self._follow(now_ns)
+        return self.inner.level(now_ns)
+
+    def _follow(self, now_ns: int) -> None:
+        self._plan.begin(now_ns)
+        self._knobs.follow(now_ns)
 
 
 def _switch_on(device: object, now_ns: int) -> None:

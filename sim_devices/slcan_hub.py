@@ -16,6 +16,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from sim_devices.attach import STEP_NS, Link
 from sim_devices.device import ByteDevice, CanDevice, Frame
@@ -27,6 +28,22 @@ BITRATES = {0: 10_000, 1: 20_000, 2: 50_000, 3: 100_000, 4: 125_000, 5: 250_000,
 MAX_ROUNDS = 16  # of answers to answers within one step
 FLAG_OVERRUN, FLAG_WARNING, FLAG_PASSIVE, FLAG_BUS_ERROR = 0x08, 0x04, 0x20, 0x80
 HEX = frozenset(b"0123456789ABCDEFabcdef")
+
+
+class Disturbance(Protocol):
+    """What stands between the nodes of a bus and their wires."""
+
+    is_dark: bool  # the nodes have no supply
+
+    def begin(self, now_ns: int) -> None:
+        """Told before the nodes are stepped."""
+
+    def carried(self, moved: Sequence[tuple[object, Frame]], now_ns: int) -> list[tuple[object, Frame]]:
+        """What of these frames, each with its sender, arrives now."""
+
+    @property
+    def next_ns(self) -> int | None:
+        """When it wants to be asked again."""
 
 
 @dataclass(slots=True)
@@ -43,10 +60,12 @@ class SlcanAdapter:
     """One adapter: a serial port on one side (a ByteDevice), the bus on the other.
 
     bus_off may be set at any time: the adapter then refuses to send and hears nothing until it is closed and reopened.
+    plugged: whether it is plugged into its host.
     """
 
     def __init__(self, bus: CanBus, *, version: str = "1013", serial: str = "A123") -> None:
         self.counters = BusCounters()
+        self.plugged = True
         self.bus_off = False
         self._bus = bus
         self._version = version.encode("ascii")
@@ -192,6 +211,7 @@ class CanBus:
         self.counters = BusCounters()
         self.nodes: dict[str, CanDevice] = {}
         self.adapters: dict[str, SlcanAdapter] = {}
+        self.disturbance: Disturbance | None = None
         self._paced = paced
         self._free_ns = 0
         self._sequence = 0
@@ -217,11 +237,18 @@ class CanBus:
     def exchange(self, now_ns: int) -> None:
         """Step all nodes to now_ns and carry frames until the bus is quiet, or busy past now_ns."""
         self._now_ns = now_ns
+        if self.disturbance is not None:
+            self.disturbance.begin(now_ns)
+            if self.disturbance.is_dark:
+                self._waiting.clear()
+                return
         for node in self.nodes.values():
             for frame in node.step(now_ns, ()):
                 self.send(node, frame)
         for _ in range(MAX_ROUNDS):
             moved = self._take(now_ns)
+            if self.disturbance is not None:
+                moved = self.disturbance.carried(moved, now_ns)
             if not moved:
                 return
             for sender, frame in moved:
@@ -236,6 +263,8 @@ class CanBus:
     @property
     def next_ns(self) -> int | None:
         """When a node or a frame under way wants to be served."""
+        if self.disturbance is not None and self.disturbance.is_dark:
+            return self.disturbance.next_ns
         due = [at_ns for node in self.nodes.values() if (at_ns := getattr(node, "next_ns", None)) is not None]
         if self._waiting:
             due.append(self._end_of_first_ns())
@@ -353,7 +382,7 @@ class _Member:
             self.adapter.note_overrun(lost.count(CR) + lost.count(BEL))
 
     def _follow_plug(self, now_ns: int) -> None:
-        wanted = self.wanted and bool(getattr(self.device, "plugged", True))
+        wanted = self.wanted and self.adapter.plugged and bool(getattr(self.device, "plugged", True))
         if wanted and not self.link.is_open:
             self.link.open()
         elif not wanted and self.link.is_open:
