@@ -27,6 +27,26 @@ def usboard_crc(data: bytes) -> int:
     return crc
 
 
+def _crc8_table(polynomial: int) -> bytes:
+    table = bytearray()
+    for value in range(256):
+        for _ in range(8):
+            value = (value << 1 ^ polynomial) & 0xFF if value & 0x80 else value << 1
+        table.append(value)
+    return bytes(table)
+
+
+LDROBOT_TABLE = _crc8_table(0x4D)
+
+
+def ldrobot_crc(data: bytes) -> int:
+    """The 8-bit code after an LDROBOT packet: polynomial 4Dh, start 0, not reflected."""
+    crc = 0
+    for byte in data:
+        crc = LDROBOT_TABLE[crc ^ byte]
+    return crc
+
+
 def sick_crc(data: bytes) -> int:
     """The 16-bit code after a SICK LMS2xx telegram: polynomial 8005h over byte pairs, start 0."""
     crc = previous = 0

@@ -25,9 +25,8 @@ What this emulator does that a naive one would not:
 
 from __future__ import annotations
 
-import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +34,7 @@ from numpy.typing import NDArray
 
 from sim_devices.device import F64, Mount, Scene
 from sim_devices.ranging import Ranger, garbled
+from sim_devices.spinner import Spinner
 from sim_devices.wire import SECOND_NS, PacedWire
 
 I64 = NDArray[np.int64]
@@ -53,8 +53,6 @@ MAX_OFFSET = 31  # eighths of a degree; above it readers disagree about the sign
 MAX_PWM = 1023
 DEFAULT_PWM = 660
 SLOWEST_SHARE = 0.2  # of the rated speed: below, the laser is off
-STEADY_SHARE = 0.9
-WOBBLE_PERIOD_S = 7.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,45 +122,6 @@ def encode_capsule(start: int, distances: I64, offsets: I64, *, first: bool) -> 
     return bytes((0xA0 | sum_ & 0x0F, 0x50 | sum_ >> 4)) + bytes(body)
 
 
-class _Motor:
-    """Where the head looks at any time: speed ramps to its target, and wobbles a little around it."""
-
-    def __init__(self, turns_per_s: float, spin_up_s: float, wobble: float) -> None:
-        self._ramp = turns_per_s / spin_up_s if spin_up_s > 0.0 else math.inf  # turns per s, a second
-        self._wobble = wobble
-        self._from_ns = 0
-        self._turns = 0.0
-        self._speed = self.target = 0.0
-
-    def turn_at(self, turns_per_s: float, now_ns: int) -> None:
-        """Go for another speed from now on."""
-        here = np.array([float(now_ns)])
-        self._turns, self._speed = float(self.turns(here)[0]), self.speed(now_ns)
-        self._from_ns, self.target = now_ns, turns_per_s
-
-    def turns(self, stamp_ns: F64) -> F64:
-        """Turns made at times (N,) since ever, clockwise."""
-        t = (stamp_ns - self._from_ns) * 1e-9
-        ramp_s = abs(self.target - self._speed) / self._ramp
-        ramping = np.minimum(t, ramp_s)
-        slope = math.copysign(self._ramp, self.target - self._speed) if ramp_s > 0.0 else 0.0
-        steady = self._speed * ramping + 0.5 * slope * ramping**2 + self.target * np.maximum(0.0, t - ramp_s)
-        omega = 2.0 * math.pi / WOBBLE_PERIOD_S
-        turns: F64 = self._turns + steady + self._wobble * self.target / omega * (1.0 - np.cos(omega * t))
-        return turns
-
-    def speed(self, now_ns: int) -> float:
-        """Turns per second, without the wobble."""
-        t = (now_ns - self._from_ns) * 1e-9
-        change = self.target - self._speed
-        return self._speed + math.copysign(min(abs(change), self._ramp * t if t > 0.0 else 0.0), change)
-
-    def steady_ns(self) -> int:
-        """When the speed is near enough to its target."""
-        missing = max(0.0, abs(self.target - self._speed) - (1.0 - STEADY_SHARE) * self.target)
-        return self._from_ns + round(missing / self._ramp * SECOND_NS)
-
-
 @dataclass(slots=True)
 class _Scan:
     """A scan that runs. zero_ns: its first sample; None while the motor is not ready."""
@@ -213,6 +172,7 @@ class RpLidar:
         self.health = health
         self.error = error
         self.lever_m = lever_m
+        self.points_left_out = 0.0  # share of the samples not sent (in capsules: without an echo)
         self._broken = False
         self._serial = serial if serial is not None else bytes((0xAA, 0x55, profile.model)) + bytes(range(1, 14))
         if len(self._serial) != 16:
@@ -223,7 +183,7 @@ class RpLidar:
             scene, mount or Mount(), self._random, range_max_m, 0.001, 0.005, noise_scale=noise_scale, dropout=dropout
         )
         self._boot_ns = round(boot_s * SECOND_NS)
-        self._motor = _Motor(profile.turns_per_s, spin_up_s, wobble)
+        self._motor = Spinner(profile.turns_per_s, spin_up_s, wobble)
         self._speed_share = 1.0
         self._pwm = DEFAULT_PWM
         self._turns_on = True
@@ -286,8 +246,12 @@ class RpLidar:
         return self._motor.target
 
     def power_on(self, now_ns: int) -> None:
-        """Start as after the supply came back: silent for boot_s, motor at its default speed."""
+        """Start as after the supply came back: silent for boot_s, the motor spins up to its default speed."""
         self._powered = True
+        self._motor.turn_at(0.0, now_ns, at_once=True)
+        self._boot(now_ns)
+
+    def _boot(self, now_ns: int) -> None:
         self._boot_done_ns = now_ns + self._boot_ns
         self._booted: bool = False
         self._wire: PacedWire = PacedWire(self.profile.line_rate_bps, now_ns)
@@ -368,7 +332,7 @@ class RpLidar:
         """Back to the start; only what is broken stays so. The motor of an A2 goes to its default."""
         if not self._broken:
             self.health, self.error = HEALTH_GOOD, 0
-        self.power_on(now_ns)
+        self._boot(now_ns)
 
     def _info(self, data: bytes, now_ns: int) -> None:
         major, minor = self.firmware
@@ -480,7 +444,10 @@ class RpLidar:
         turn = np.floor(turns + 0.5 / ANGLE_UNITS).astype(np.int64)  # an angle that rounds up to 360 begins a turn
         distance, quality = self._distances(turns, stamp_ns)
         out = bytearray()
-        for k in range(scan.batch):
+        kept: Sequence[int] = range(scan.batch)
+        if self.points_left_out:
+            kept = [k for k in kept if self._random.random() >= self.points_left_out]
+        for k in kept:
             begins = scan.last_turn is not None and int(turn[k]) != scan.last_turn
             scan.last_turn = int(turn[k])
             out += encode_node(int(angle[k]), int(distance[k]), int(quality[k]), begins=begins)
@@ -490,6 +457,8 @@ class RpLidar:
         """32 samples as one express capsule."""
         offset = self._offsets(turns, stamp_ns)
         distance, _ = self._distances(turns - offset / (8.0 * 360.0), stamp_ns)
+        if self.points_left_out:
+            distance[self._random.random(scan.batch) < self.points_left_out] = 0
         start = round(float(turns[0] % 1.0) * ANGLE_UNITS) % ANGLE_UNITS
         capsule = encode_capsule(start, distance, offset, first=scan.is_first)
         scan.is_first = False

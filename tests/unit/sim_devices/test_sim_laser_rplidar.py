@@ -392,3 +392,20 @@ def test_same_stream_however_it_is_stepped(steps: list[int]) -> None:
                 break
         streams.append(bytes(out))
     assert streams[0] == streams[1]
+
+
+def test_left_out_points_make_turns_of_varying_length() -> None:
+    bench = Bench()
+    bench.laser.points_left_out = 0.3
+    got = nodes(stream(bench, SCAN, 2.0))
+    assert len(got) == pytest.approx(2800, rel=0.05)
+    assert sum(begins for begins, _, _, _ in got) in (13, 14, 15)
+
+
+def test_supply_lost_stops_the_motor_and_a_reset_does_not() -> None:
+    bench = Bench(spin_up_s=1.0, boot_s=0.2)
+    bench.ask(RESET, 0.3)
+    assert nodes(stream(bench, SCAN, 0.3))
+    bench.laser.power_on(bench.now_ns)
+    bench.wait(0.3)
+    assert bench.ask(SCAN, 0.3) == SCAN_HEAD
