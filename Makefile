@@ -9,6 +9,9 @@ export UMFELD_DATA ?= $(abspath ../shared/data)
 endif
 PYTEST := $(BIN)/python -m pytest
 JOBS ?= 2
+FUZZ_CASES ?= 300000
+FUZZ_ROUNDS ?= 10
+SOAK ?= 20
 
 .PHONY: help venv demo test lint bench fuzz soak hil interop format clean
 
@@ -32,6 +35,23 @@ lint: venv  ## ruff, mypy strict, import-linter
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+bench: venv  ## Latency, load, start and kernels against their budgets (docs/performance.md)
+	$(BIN)/umfeld bench --all $(ARGS)
+
+hil: venv  ## Driver tests on hardware: make hil DEVICE=laser=/dev/ttyACM0 (docs/testing.md)
+	$(if $(DEVICE),,$(error name the hardware: make hil DEVICE=laser=/dev/ttyACM0))
+	$(PYTEST) -m hil $(addprefix --device ,$(DEVICE)) $(ARGS)
+
+fuzz: venv  ## Damaged bytes and random scenes, far more than `make test` tries
+	UMFELD_FUZZ_CASES=$(FUZZ_CASES) $(PYTEST) tests/fuzz -n $(JOBS) --timeout 3600 $(ARGS)
+	for round in $$(seq $(FUZZ_ROUNDS)); do $(PYTEST) -q -x -n $(JOBS) tests/property --hypothesis-seed $$RANDOM $(ARGS) || exit 1; done
+
+soak: venv  ## Everything with real wires again and again, SOAK times, stopping at the first failure
+	for round in $$(seq $(SOAK)); do echo "round $$round"; $(PYTEST) -q -x tests/loop tests/crash $(ARGS) || exit 1; done
+
+interop: venv  ## Against other people's programs, where they are installed
+	@if [ -d tests/interop ]; then $(PYTEST) tests/interop $(ARGS); else echo "no tests/interop in this tree"; fi
 
 format: venv  ## Lay out the code
 	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
