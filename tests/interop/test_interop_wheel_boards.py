@@ -1,0 +1,169 @@
+"""Other people's drivers on the emulated wheel boards, over ptys: basicmicro, tcr-roboclaw, odrive-can."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import importlib.util
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+import serial
+
+from sim_devices.attach import Attachment, PtyLink
+from sim_devices.device import F64, Mount
+from sim_devices.encoder_arduino_bridge import ArduinoBridge, Sonar
+from sim_devices.encoder_odrive import ODriveAxis
+from sim_devices.encoder_roboclaw import RoboClaw
+from sim_devices.slcan_hub import CanBus, CanBusStation
+from sim_devices.wheel import Side, Wheel
+
+TURN_M = 2.0 * np.pi * 0.1
+
+
+def needs(package: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(importlib.util.find_spec(package) is None, reason=f"needs {package}")
+
+
+class Bench:
+    """Wheels on blocks that turn as their motors tell them."""
+
+    def __init__(self) -> None:
+        self._told: dict[str, tuple[float, int, float]] = {"left": (0.0, 0, 0.0), "right": (0.0, 0, 0.0)}
+
+    def beam_ranges(self, mount: Mount, bearing_rad: F64, stamp_ns: F64, range_max_m: float) -> F64:
+        return np.full(len(bearing_rad), 2.0)
+
+    def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
+        return 1.07
+
+    def wheel_travel_m(self, now_ns: int) -> tuple[float, float]:
+        return self._at("left", now_ns), self._at("right", now_ns)
+
+    def drive_wheel(self, now_ns: int, side: Side, speed_m_s: float) -> None:
+        self._told[side] = (self._at(side, now_ns), now_ns, speed_m_s)
+
+    def _at(self, side: str, now_ns: int) -> float:
+        base_m, since_ns, speed_m_s = self._told[side]
+        return base_m + speed_m_s * (now_ns - since_ns) * 1e-9
+
+
+def pair(ticks: float) -> tuple[Wheel, Wheel]:
+    scene = Bench()
+    return Wheel(scene, "left", 0.1, ticks), Wheel(scene, "right", 0.1, ticks)
+
+
+@pytest.fixture
+def claw(tmp_path: Path) -> Iterator[str]:
+    loop = Attachment()
+    loop.add("claw", RoboClaw(*pair(1000.0)), PtyLink(tmp_path / "claw"))
+    with loop:
+        yield str(tmp_path / "claw")
+
+
+@needs("basicmicro")
+def test_basicmicro_reads_and_drives(claw: str) -> None:
+    board = importlib.import_module("basicmicro").Basicmicro(claw, 38400)
+    assert board.Open()
+    try:
+        assert board.ReadVersion(0x80) == (True, "USB Roboclaw 2x15a v4.2.4\n")
+        assert board.SpeedM1M2(0x80, 500, -500)
+        begin = time.monotonic()
+        time.sleep(0.5)
+        ok, first, second = board.GetEncoders(0x80)
+        assert ok
+        assert first == pytest.approx(500 * (time.monotonic() - begin), rel=0.2)
+        assert (2**32 - second) == pytest.approx(first, abs=5)
+        assert board.ReadSpeedM1(0x80)[1] == pytest.approx(500, abs=2)
+        assert board.ReadSpeedM2(0x80)[1:] == (pytest.approx(500, abs=2), 1)
+        assert board.ReadMainBatteryVoltage(0x80)[1] == 121
+        assert board.GetStatus(0x80)[0]
+        assert board.SetM1VelocityPID(0x80, 1.0, 0.5, 0.25, 44000)
+        assert tuple(board.ReadM1VelocityPID(0x80))[1:] == (0.25, 1.0, 0.5, 44000)
+        assert board.SpeedM1M2(0x80, 0, 0)
+        assert board.SetEncM1(0x80, 1000)
+        assert board.ReadEncM1(0x80)[1] == 1000
+        assert board.ResetEncoders(0x80)
+        assert board.ReadEncM1(0x80)[1] == 0
+    finally:
+        board.close()
+
+
+@needs("tcr_roboclaw")
+def test_tcr_roboclaw_reads(claw: str) -> None:
+    board = importlib.import_module("tcr_roboclaw").Roboclaw(claw, 38400)
+    assert board.open()
+    assert board.SpeedM1(700)
+    time.sleep(0.3)
+    assert board.ReadEncM1()[1] > 100
+    assert board.ReadSpeedM1()[1] == pytest.approx(700, abs=3)
+    assert board.ResetEncoders()
+
+
+@needs("odrive_can")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # it closes its bus a second time
+@pytest.mark.parametrize("generation", ["0.5", "0.6"])
+def test_odrive_can_reads_and_drives(tmp_path: Path, generation: str) -> None:
+    station = CanBusStation(CanBus(bitrate_bps=250_000))
+    station.add_member("host", PtyLink(tmp_path / "can"))
+    station.bus.add_node("axis", ODriveAxis(pair(1.0)[0], 0, generation=generation))
+    loop = Attachment()
+    loop.add_station("can", station)
+    make: Callable[..., Any] = importlib.import_module("odrive_can.odrive").ODriveCAN
+
+    async def drive() -> None:
+        bus = can.Bus(interface="slcan", channel=str(tmp_path / "can"), bitrate=250_000, sleep_after_open=0)
+        axis = make(axis_id=0, can_bus=bus)
+        await asyncio.wait_for(axis.start(), 3.0)
+        try:
+            axis.check_alive()
+            axis.check_errors()
+            assert (await axis.get_bus_voltage_current())["Bus_Voltage"] == 24.0
+            await axis.set_axis_state("CLOSED_LOOP_CONTROL")
+            assert axis.axis_state == "CLOSED_LOOP_CONTROL"
+            axis.set_controller_mode("VELOCITY_CONTROL", "PASSTHROUGH")
+            axis.set_input_vel(2.0)
+            await asyncio.sleep(0.5)
+            estimate = await axis.get_encoder_estimates()
+            assert estimate["Vel_Estimate"] == pytest.approx(2.0, abs=0.01)
+            assert 0.5 < estimate["Pos_Estimate"] < 3.0
+        finally:
+            axis.stop()
+            bus.shutdown()
+
+    with loop:
+        asyncio.run(drive())
+
+
+def test_bridge_by_a_blocking_serial_client(tmp_path: Path) -> None:
+    """As the sketch's own Python driver talks: open once at the default rate, again at 57600, then one at a time."""
+    board = ArduinoBridge(*pair(1000.0), sonars={7: Sonar(Mount())}, boot_s=0.2, noise_m=0.0)
+    loop = Attachment()
+    loop.add("board", board, PtyLink(tmp_path / "board"))
+    with loop:
+        serial.Serial(str(tmp_path / "board")).close()
+        with serial.Serial(str(tmp_path / "board"), 57600, timeout=0.5) as port:
+
+            def execute(command: str, attempts: int = 5) -> str:
+                for _ in range(attempts):
+                    port.reset_input_buffer()
+                    port.write(command.encode() + b"\r")
+                    value = port.read_until(b"\r").decode().strip()
+                    if value not in ("", "Invalid Command"):
+                        return value
+                raise AssertionError(f"no answer to {command!r}")
+
+            assert execute("b") == "57600"
+            assert execute("r") == "OK"
+            assert execute("m 20 20") == "OK"
+            time.sleep(0.3)
+            left, right = (int(word) for word in execute("e").split())
+            assert left == pytest.approx(right, abs=2)
+            assert 100 < left < 900
+            assert execute("p 7") == "107"
+            assert execute("m 0 0") == "OK"
