@@ -52,13 +52,15 @@ class ClosureSettings:
     place_m: key scans on either side along the way that make up a place.  every_m: a place is searched for so often.
     explained, refuted: shares of the points, see Agreement.  weakest_per_m2: least information in the worst direction.
     agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way.
-    pending: how many closures wait at most.
+    pending: how many closures wait at most.  undone_below: the weight under which a closure is forgotten in the end.
+    floor_*: errors of a match that no matcher sees.  misfit: median squared distance of new closures from the map that
+    makes an optimisation due; so do optimise_every new ones.
     """
 
     apart_m: float = 8.0
     drift_m: float = 0.6
     drift_share: float = 0.05
-    search_m: float = 14.0
+    search_m: float = 20.0
     tracked_m: float = 1.0
     turn_start_rad: float = math.radians(6.0)
     turn_rad_per_m: float = math.radians(0.15)
@@ -69,14 +71,15 @@ class ClosureSettings:
     score: float = 0.55
     rival: float = 0.93
     explained: float = 0.55
-    overlap: float = 0.90
-    mean_cost: float = 0.35
-    weakest_per_m2: float = 400.0
+    overlap: float = 0.93
+    mean_cost: float = 0.30
+    weakest_per_m2: float = 1000.0
     agreeing: int = 3
     agreeing_way_m: float = 1.2
     pending: int = 64
     floor_m: float = 0.015
     floor_rad: float = math.radians(0.15)
+    undone_below: float = 0.15
     misfit: float = 30.0
     optimise_every: int = 60
 
@@ -167,7 +170,6 @@ class Work:
         pending += searched
         poses, weight = shot.poses, None
         unoptimised = shot.unoptimised + len(tracked)
-        covariance: F64 | None = None
         group, waiting = self._agreeing(pending)
         if group:
             trial = self._solve(poses, accepted + group, start_scale=1e4)
@@ -183,6 +185,8 @@ class Work:
             poses, weight, unoptimised = solved.poses, solved.weight, 0
         if weight is None:
             weight = self._weights(poses, accepted)
+        if shot.thorough:
+            accepted, weight = self._without_refuted(accepted, weight)
         edges = shot.path.joined(edges_of(accepted))
         covariance = covariance_of(poses, edges, weight, len(poses) - 1)
         numbered, number = _numbered(accepted, shot.next_number)
@@ -205,10 +209,17 @@ class Work:
             near, wide = self._places(key, way_m[row])
             for place in near:
                 tracked += self._track(key, place)
-            if wide and self.snapshot.travel_m[key] - last_search_m >= self.settings.every_m:
+            # Where the search is wide, it is made more rarely: its cost grows with the square.
+            every_m = max(self.settings.every_m, *(0.15 * self._drift(way_m[row][place]) for place in wide), 0.0)
+            if wide and self.snapshot.travel_m[key] - last_search_m >= every_m:
                 last_search_m = float(self.snapshot.travel_m[key])
                 searched += self._search(key, wide, way_m[row])
         return tracked, searched
+
+    def _drift(self, way_m: F64) -> F64:
+        """How far off keys may be from each other after ways of these lengths through the graph; any shape."""
+        s = self.settings
+        return np.minimum(s.search_m, s.drift_m + s.drift_share * np.asarray(way_m))
 
     def _ways(self, keys: tuple[int, ...]) -> F64:
         """(K, N) length of the shortest way through the graph from each key to every other."""
@@ -235,7 +246,7 @@ class Work:
             return [], []
         off = shot.poses[earlier] - shot.poses[key]
         distance = np.hypot(off[:, 0], off[:, 1])
-        drift = np.minimum(s.search_m, s.drift_m + s.drift_share * way_m[earlier])
+        drift = self._drift(way_m[earlier])
         facing = distance + 1.0 - np.cos(off[:, 2])  # of places equally near, the one seen from the same side
         trackable = (drift <= s.tracked_m) & (distance < 2.0)
         near = self._spread(earlier[trackable], facing[trackable], s.place_m * 2.0, 2)
@@ -282,10 +293,11 @@ class Work:
         found: list[tuple[Closure, float]] = []
         self._events["searches"] += 1
         for place in places:
-            drift = min(s.search_m, s.drift_m + s.drift_share * float(way_m[place]))
+            drift = float(self._drift(way_m[place]))
             turn = min(s.turn_most_rad, s.turn_start_rad + s.turn_rad_per_m * float(way_m[place]))
             rows = self._around(place, key, max(s.place_m, 0.5 * drift), 16)
-            spot = find_view(view, raster_of(shot.views, rows, shot.poses[rows]), here, window_m=drift, turn_rad=turn)
+            raster = raster_of(shot.views, rows, shot.poses[rows], window_m=drift)
+            spot = find_view(view, raster, here, window_m=drift, turn_rad=turn)
             if spot is None or spot.score < s.score:
                 self._events["no_place_fits"] += 1
                 continue
@@ -368,6 +380,13 @@ class Work:
         return tuple(pending[-self.settings.pending :])
 
     # --- optimising
+
+    def _without_refuted(self, accepted: list[Closure], weight: F64) -> tuple[list[Closure], F64]:
+        """Closures that the finished map contradicts are undone for good."""
+        kept = weight[len(self.snapshot.path) :] >= self.settings.undone_below
+        self._events["undone"] += int(np.sum(~kept))
+        chosen = np.concatenate((np.ones(len(self.snapshot.path), dtype=np.bool_), kept))
+        return [c for c, good in zip(accepted, kept) if good], weight[chosen]
 
     def _is_due(self, accepted: list[Closure], unoptimised: int) -> bool:
         if not unoptimised:

@@ -18,6 +18,8 @@ U8 = NDArray[np.uint8]
 
 RESOLUTION_M = 0.10
 BLOCK = 4
+WIDE_BLOCK = 8
+WIDE_M = 5.0  # wider windows are cut into wider blocks
 FARTHEST_M = 18.0  # points beyond are left out: at one degree a step they are spread over cells
 POINTS = 120
 TURN_STEP_RAD = math.radians(1.0)
@@ -28,10 +30,12 @@ RIVAL_SHARE = 0.85  # rivals that score less are not looked for
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """Likelihood of a surface around some key scans: (H, W) uint8 cells from (x0_m, y0_m) on, and their pooled copy."""
+    """Likelihood of a surface around some key scans: (H, W) uint8 cells from (x0_m, y0_m) on, and their pooled copy,
+    the maxima over blocks of `block` cells."""
 
     fine: U8
     pooled: U8
+    block: int
     x0_m: float
     y0_m: float
 
@@ -46,13 +50,14 @@ class Found:
     rival: float
 
 
-def raster_of(store: ViewArrays, rows: I64, poses: F64) -> Raster:
-    """Draw views `rows` (R,) at poses (R, 3)."""
+def raster_of(store: ViewArrays, rows: I64, poses: F64, *, window_m: float = 0.0) -> Raster:
+    """Draw views `rows` (R,) at poses (R, 3), to be searched within window_m."""
+    block = WIDE_BLOCK if window_m > WIDE_M else BLOCK
     x0, y0 = (float(v) - FARTHEST_M for v in poses[:, :2].min(axis=0))
     x1, y1 = (float(v) + FARTHEST_M for v in poses[:, :2].max(axis=0))
     fine = np.zeros((math.ceil((y1 - y0) / RESOLUTION_M) + 1, math.ceil((x1 - x0) / RESOLUTION_M) + 1), dtype=np.uint8)
     draw_points(store.x, store.y, store.quality, rows, poses, x0, y0, RESOLUTION_M, fine)
-    return Raster(fine, pool(fine, BLOCK), x0, y0)
+    return Raster(fine, pool(fine, block), block, x0, y0)
 
 
 def find_view(view: View, raster: Raster, guess: Pose2, *, window_m: float, turn_rad: float) -> Found | None:
@@ -65,7 +70,7 @@ def find_view(view: View, raster: Raster, guess: Pose2, *, window_m: float, turn
     px, py = view.x[chosen].astype(np.float64), view.y[chosen].astype(np.float64)
     result = np.zeros(5)
     search(
-        raster.fine, raster.pooled, BLOCK, raster.x0_m, raster.y0_m, RESOLUTION_M, px, py,
+        raster.fine, raster.pooled, raster.block, raster.x0_m, raster.y0_m, RESOLUTION_M, px, py,
         np.array([guess.x_m, guess.y_m, guess.yaw_rad]), window_m, turn_rad, TURN_STEP_RAD, APART_M, APART_RAD,
         RIVAL_SHARE, result,
     )  # fmt: skip

@@ -54,6 +54,7 @@ Progress = Callable[[int, int], None]
 NEARBY = Reach((0.30, 0.22, 0.18, 0.15), (0.08, 0.06, 0.05, 0.04))
 HELD_PER_M2 = 2500.0  # the worst direction of a match is sure to 2 cm: it can judge odometry
 LEAST_FIT = 0.3  # of a view's points must be explained, or it says nothing about where it was taken
+UNMATCHED_PATIENCE = 4.0  # a sweep that fits nothing may be dust, a crowd or a slope: wait before it is kept
 CLEARLY = 1.1  # times better a match must be to be believed against the prediction
 
 
@@ -149,7 +150,7 @@ class _Trust:
 
     LEARN = 0.03
     MOST = 5.0
-    LEAST = 3.0  # odometry errs in one direction for long, so it must not pull where a match holds
+    LEAST = 1.0
     LARGEST = 50.0
 
     def __init__(self, factor: float) -> None:
@@ -230,7 +231,7 @@ class Slam:
             return self._told(scan.stamp_ns, guess.map_from_sensor, base_from_sensor, odom_from_base, None, True)
         match = self._matched(view, guess)
         pose = guess.map_from_sensor if match is None else match.pose
-        is_key = self._is_new_ground(sensor, pose)
+        is_key = self._is_new_ground(sensor, pose, patience=1.0 if match is not None else UNMATCHED_PATIENCE)
         if is_key:
             self._keep(scan.stamp_ns, sensor, view, pose, base_from_sensor, odom_from_base, match)
         return self._told(scan.stamp_ns, pose, base_from_sensor, odom_from_base, match, is_key)
@@ -322,7 +323,9 @@ class Slam:
         """Of a free match, one that the prediction holds, and one searched for: what lies nearer to the prediction,
         unless another is clearly better."""
         store, poses = self._views.arrays(), self._poses[rows]
-        held = match_view(view, store, rows, poses, guess.map_from_sensor, prior=guess.information(), reach=NEARBY)
+        doubt = 0.5 if match is None else min(match.mean_cost, 0.7)
+        pull = guess.information() / (1.0 - doubt) ** 4  # leaves that move and crowds look like many points
+        held = match_view(view, store, rows, poses, guess.map_from_sensor, prior=pull, reach=NEARBY)
         best = match if held is None or (match is not None and match.score > CLEARLY * held.score) else held
         fits = 0.0 if best is None else agreement(view, store, rows, poses, best.pose).explained
         if fits < 0.5:
@@ -347,12 +350,14 @@ class Slam:
         found = agreement(view, store, rows, poses, other.pose).explained
         return (other, found) if found > fits + 0.1 else (best, fits)
 
-    def _is_new_ground(self, sensor: str, pose: Pose2) -> bool:
+    def _is_new_ground(self, sensor: str, pose: Pose2, *, patience: float) -> bool:
+        """Whether the sensor has moved enough since its last key scan for another one."""
         last = self._sensors[sensor].last_key
         if last < 0:
             return True
         off = self._key_pose(last).inverse() @ pose
-        return math.hypot(off.x_m, off.y_m) > self.settings.key_m or abs(off.yaw_rad) > self.settings.key_rad
+        moved_m, turned_rad = math.hypot(off.x_m, off.y_m), abs(off.yaw_rad)
+        return moved_m > patience * self.settings.key_m or turned_rad > patience * self.settings.key_rad
 
     def _key_pose(self, key: int) -> Pose2:
         x, y, yaw = self._poses[key].tolist()
