@@ -159,6 +159,7 @@ class WirePlayer:
         self._conversations = dict(conversations)
         self._broken: set[str] = set()  # after an exception, left alone until begun anew, as the reader does
         self._expected: list[Item] = []
+        self._surplus = 0
         self.sent = 0
         self.sent_otherwise = 0
         self.bugs = 0
@@ -180,8 +181,9 @@ class WirePlayer:
                 pass
 
     def _ask(self, now_ns: int) -> None:
-        self.sent_otherwise += len(self._expected)
+        self.sent_otherwise += len(self._expected) + self._surplus
         self._expected.clear()
+        self._surplus = 0
         for source, conversation in self._conversations.items():
             if source not in self._broken:
                 try:
@@ -193,8 +195,8 @@ class WirePlayer:
         if self._expected and self._expected[0] == item:
             self._expected.pop(0)
             self.sent += 1
-        else:
-            self.sent_otherwise += 1
+        else:  # what is sent after the last turn of all is the farewell
+            self._surplus += 1
 
     def _receive(self, source: str, item: bytes | CanFrame, stamp_ns: int) -> Iterator[tuple[str, Reading]]:
         if source in self._broken:

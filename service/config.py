@@ -453,6 +453,25 @@ class Store(Section):
     )
 
 
+class RecordingSettings(Section):
+    """What happened, byte by byte, for `umfeld replay`."""
+
+    enabled: bool = Field(default=False, description="From the first byte; `umfeld record` does it on demand.")
+    folder: str | None = Field(
+        default=None, description="Where to; default: recordings in $STATE_DIRECTORY or ~/.local/share/umfeld."
+    )
+    published: bool = Field(default=True, description="Keep what is published too, not only what replay needs.")
+    file_mb: float = Field(default=256.0, ge=1, le=100000, description="A file this large is ended and the next begun.")
+    total_mb: float = Field(default=8000.0, ge=2, description="All recordings together; the oldest make room.")
+    free_mb: float = Field(default=1000.0, ge=0, description="So much of the disk is left free for others.")
+
+    @model_validator(mode="after")
+    def _room_for_two(self) -> RecordingSettings:
+        if self.total_mb < 2 * self.file_mb:
+            raise ValueError("total_mb must hold at least two files of file_mb")
+        return self
+
+
 class Log(Section):
     """What is written to standard error."""
 
@@ -478,6 +497,9 @@ class Config(Section):
     network: Network = Field(default=Network(), description="The Zenoh router.")
     ros: Ros = Field(default=Ros(), description="ROS 2 beside our own keys.")
     store: Store = Field(default=Store(), description="The map on disk.")
+    recording: RecordingSettings = Field(
+        default=RecordingSettings(), description="What happened, byte by byte, for `umfeld replay`."
+    )
     log: Log = Field(default=Log(), description="What is written to standard error.")
 
     def devices(self) -> Iterator[tuple[str, str, Device]]:
@@ -510,8 +532,19 @@ class Config(Section):
         """The map's file."""
         if self.store.path is not None:
             return Path(self.store.path).expanduser()
-        state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-        return (Path(state) if state else Path.home() / ".local/share/umfeld") / f"{self.robot.id}.umfeld"
+        return state_folder() / f"{self.robot.id}.umfeld"
+
+    def recording_folder(self) -> Path:
+        """Where recordings are kept."""
+        if self.recording.folder is not None:
+            return Path(self.recording.folder).expanduser()
+        return state_folder() / "recordings"
+
+
+def state_folder() -> Path:
+    """Where a service keeps its own: systemd's StateDirectory, or a place in the user's home."""
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    return Path(state) if state else Path.home() / ".local/share/umfeld"
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,24 +20,27 @@ import select
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from drivers.reader import WireReader
-from service import assemble, health
+from mapping.frames import IDENTITY, Pose2
+from service import assemble, health, recording
 from service.clock import Clock, SystemClock
 from service.config import Config, Loaded
 from service.errors import Trouble
-from service.fusion import Fusion, OdometryOnly
+from service.fusion import OdometryOnly
 from service.live_map import LiveMap, restore
 from service.locks import Claims
 from service.outputs import HealthOut
 from service.payloads import RobotInfo, SensorPlace
 from service.publisher import Publisher
+from service.recording import RecordedFusion, Recorder
 from service.ros import RosSettings
+from service.rpc import CallRefused
 from service.sensors import Chain, Laser
 from service.store import MapStore, Provenance
 from service.systemd import Notifier
@@ -65,6 +68,7 @@ class Daemon:
         self._readers: list[WireReader[Any]] = []
         self._clean = True
         self._meter = health.ProcessMeter(self._clock.now_ns())
+        self._recorder = Recorder(recording_settings(self._config), clock=self._clock)
 
     # --- the life of the process
 
@@ -113,14 +117,17 @@ class Daemon:
         start_pose = None if store is None or maps.building is None else restore(maps.building.grid, store)
         self._publisher = self._make_publisher()
         self._parts.callback(self._close_publisher)
+        self._publisher.add_tap(self._recorder.message)
         starting = _in_thread("router", self._publisher.start)  # takes half a second, the kernels as much
         assemble.warm_up(config)
         starting()
-        self._fusion = Fusion(
+        self._fusion = RecordedFusion(
             assemble.parts(
                 config, self._sensors, maps, OdometryOnly() if start_pose is None else OdometryOnly(start_pose)
             )
         )
+        self._building = maps.building
+        self._fusion.recorder = self._recorder
         self._worker = Worker(
             self._fusion,
             self._publisher.offer,
@@ -133,8 +140,15 @@ class Daemon:
             self._live_map = LiveMap(maps.building, store, ask=self._worker.ask, pose=self._fusion.pose)
             self._publisher.calls.register_map_service(self._live_map)
             self._parts.callback(self._finish_map, self._live_map)
-        self._readers = [wire.reader(self._worker.sink, self._clock.now_ns) for wire in wires]
-        self._publisher.publish_info(self._info())
+        sink = self._recorder.sink(self._worker.sink)
+        self._readers = [wire.reader(sink, self._clock.now_ns, self._recorder.tap(wire.name)) for wire in wires]
+        self._publisher.calls.register("record_start", self._on_record_start)
+        self._publisher.calls.register("record_stop", lambda _arguments: self._end_recording())
+        self._publisher.calls.register("record_status", lambda _arguments: self._recorder.status())
+        self._parts.callback(self._end_recording)
+        if config.recording.enabled:
+            self._begin_recording(start_pose or IDENTITY, complete=True)
+        self._publisher.publish_info(robot_info(config, self._wall_ns()))
         self._worker.start()
         self._parts.callback(self._stop_worker)
         if self._live_map is not None and store is not None:
@@ -173,26 +187,6 @@ class Daemon:
             ros=ros if config.ros.enabled else None,
         )
 
-    def _info(self) -> RobotInfo:
-        config = self._config
-        places: list[SensorPlace] = []
-        for sensor in self._sensors.values():
-            if isinstance(sensor, Laser):
-                places.append(SensorPlace(sensor.name, sensor.kind, sensor.base_from_sensor, sensor.height_m))
-            elif isinstance(sensor, Chain):
-                places.extend(
-                    SensorPlace(f"{sensor.name}_{number}", sensor.kind, each.base_from_transducer, each.height_m)
-                    for number, each in enumerate(sensor.transducers, start=1)
-                )
-        return RobotInfo(
-            config.robot.id,
-            f"robots/{config.robot.id}",
-            _version(),
-            self._wall_ns(),
-            tuple(places),
-            config.robot.footprint_m,
-        )
-
     def _health(self, now_ns: int) -> HealthOut:
         inside = health.Inside(
             drops=self._fusion.drops,
@@ -201,8 +195,9 @@ class Daemon:
                 **self._fusion.counters(),
                 **{f"publish.{name}": count for name, count in self._publisher.counters().items()},
                 **({} if self._live_map is None else self._live_map.counters()),
+                **self._recorder.counters(),
             },
-            troubles=[*self._fusion.troubles(now_ns), *self._map_troubles()],
+            troubles=[*self._fusion.troubles(now_ns), *self._map_troubles(), *self._recording_troubles()],
         )
         kinds = {name: sensor.kind for name, sensor in self._sensors.items()}
         wires = [reader.health() for reader in self._readers]
@@ -210,6 +205,56 @@ class Daemon:
 
     def _map_troubles(self) -> list[str]:
         trouble = None if self._live_map is None else self._live_map.trouble()
+        return [] if trouble is None else [trouble]
+
+    # --- recording
+
+    def _on_record_start(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Begin a recording on request; every device is set up anew, so that its set-up is in it."""
+        folder, published = arguments.get("folder"), arguments.get("published")
+        if not isinstance(folder, str | None) or not isinstance(published, bool | None):
+            raise CallRefused('"folder" must be a path, "published" true or false')
+        if folder is not None and not Path(folder).is_absolute():
+            raise CallRefused(f'"folder" must be an absolute path, not {folder}')
+        pose = self._worker.ask(lambda: self._fusion.pose()) or IDENTITY
+        path = self._begin_recording(
+            pose, complete=False, folder=None if folder is None else Path(folder), published=published
+        )
+        for reader in self._readers:
+            reader.start_anew()
+        return {"file": str(path)}
+
+    def _begin_recording(
+        self, map_from_odom: Pose2, *, complete: bool, folder: Path | None = None, published: bool | None = None
+    ) -> Path:
+        building = self._building
+        tiles = () if building is None else tuple(self._worker.ask(lambda: list(building.grid.tiles())))
+        start = recording.Start(
+            self._config.robot.id,
+            _version(),
+            self._config.model_dump_json(),
+            tuple(self._sensors),
+            (map_from_odom.x_m, map_from_odom.y_m, map_from_odom.yaw_rad),
+            complete,
+            tiles,
+        )
+        path = self._recorder.begin(start, folder=folder, published=published)
+        log.info("recording to %s", path)
+        return path
+
+    def _end_recording(self) -> Mapping[str, Any]:
+        """Close the recording, if there is one, with a digest of the map as it stands."""
+        if not self._recorder.is_active:
+            return {"recording": False}
+        building, end = self._building, {}
+        if building is not None:
+            end = self._worker.ask(lambda: {"map_sha256": recording.digest_of(building.grid)})
+        done = self._recorder.end(end) or {"recording": False}
+        log.info("recorded: %s", ", ".join(done.get("files", ())))
+        return done
+
+    def _recording_troubles(self) -> list[str]:
+        trouble = self._recorder.trouble()
         return [] if trouble is None else [trouble]
 
     def _summary(self) -> str:
@@ -291,6 +336,33 @@ def network_settings(config: Config) -> NetworkSettings:
         if tls is None
         else TlsFiles(tls.root_ca_certificate, tls.listen_certificate, tls.listen_private_key, tls.mutual),
         zenoh_config=None if network.config is None else Path(network.config).expanduser(),
+    )
+
+
+def robot_info(config: Config, started_ns: int) -> RobotInfo:
+    """What the `info` document says of a configuration. started_ns: wall clock."""
+    places: list[SensorPlace] = []
+    for sensor in assemble.sensors(config).values():
+        if isinstance(sensor, Laser):
+            places.append(SensorPlace(sensor.name, sensor.kind, sensor.base_from_sensor, sensor.height_m))
+        elif isinstance(sensor, Chain):
+            places.extend(
+                SensorPlace(f"{sensor.name}_{number}", sensor.kind, each.base_from_transducer, each.height_m)
+                for number, each in enumerate(sensor.transducers, start=1)
+            )
+    base = f"robots/{config.robot.id}"
+    return RobotInfo(config.robot.id, base, _version(), started_ns, tuple(places), config.robot.footprint_m)
+
+
+def recording_settings(config: Config) -> recording.Settings:
+    """Where recordings go and how large they get."""
+    wanted = config.recording
+    return recording.Settings(
+        folder=config.recording_folder(),
+        file_bytes=round(wanted.file_mb * 1e6),
+        total_bytes=round(wanted.total_mb * 1e6),
+        free_bytes=round(wanted.free_mb * 1e6),
+        published=wanted.published,
     )
 
 
