@@ -23,6 +23,10 @@
     [[circles]]                      # pillars, bins
     center = [3.0, 3.0]
     radius_m = 0.15
+    [[pits]]                         # stairs down, ramps of a loading bay: the floor is lower here
+    center = [5.0, 1.0]
+    size_m = [1.0, 2.0]
+    depth_m = 0.2
     [[walkers]]                      # people on their way round these points
     points = [[1, 1], [3, 1]]
     speed_m_s = 0.8
@@ -104,6 +108,14 @@ class Circle:
 
 
 @dataclass(frozen=True, slots=True)
+class Pit:
+    center: Point
+    size_m: Point
+    yaw_deg: float = 0.0
+    depth_m: float = 0.2
+
+
+@dataclass(frozen=True, slots=True)
 class WalkerPlan:
     points: tuple[Point, ...]
     speed_m_s: float = 0.8
@@ -134,6 +146,7 @@ class FloorPlan:
     boxes: tuple[Box, ...] = ()
     tables: tuple[Table, ...] = ()
     circles: tuple[Circle, ...] = ()
+    pits: tuple[Pit, ...] = ()
     walkers: tuple[WalkerPlan, ...] = ()
     route: Route | None = None
 
@@ -144,6 +157,7 @@ LISTS: dict[str, type] = {
     "boxes": Box,
     "tables": Table,
     "circles": Circle,
+    "pits": Pit,
     "walkers": WalkerPlan,
 }
 
@@ -250,6 +264,7 @@ class _Rule:
 _RULES = {
     "thickness_m": _Rule(0.0),
     "width_m": _Rule(0.0, True),
+    "depth_m": _Rule(0.0, True),
     "radius_m": _Rule(0.0, True),
     "leg_radius_m": _Rule(0.0, True),
     "corner_radius_m": _Rule(0.0),

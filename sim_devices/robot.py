@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim_devices.device import Mount
 from sim_devices.floor_plan import Point, Route, WorldError
+from sim_devices.wheel import Side
 from sim_devices.world import World
 
 F64 = NDArray[np.float64]
@@ -29,6 +30,7 @@ SIDEWAYS_ACCELERATION_M_S2 = 0.8
 SLIP_STEP_S = 0.05
 SLIPS_A_BLOCK = 1200
 COMMAND_HOLDS_S = 0.5
+UNTIL_TOLD_S = 1e6  # a motor turns until it is told otherwise
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,6 +365,8 @@ class SimScene:
         self.motion = motion
         self.origin_ns = origin_ns
         self.motion_ns: int | None = origin_ns if begin_at_origin else None
+        self._track_width_m = track_width_m
+        self._wheel_m_s: dict[Side, float] = {"left": 0.0, "right": 0.0}
         self._wheels = Wheels(motion, track_width_m=track_width_m, errors=errors or WheelErrors())
         self._newest_pose: tuple[int, F64] | None = None
         self._newest_travel: tuple[int, tuple[float, float]] | None = None
@@ -402,6 +406,30 @@ class SimScene:
             self._newest_travel = (now_ns, (float(left), float(right)))
         return self._newest_travel[1]
 
+    def ray_ranges(self, origin_m: F64, direction: F64, stamp_ns: F64, range_max_m: float) -> F64:
+        """See `mount_nodding.SolidScene`: each beam from where the robot is when it is fired."""
+        stamps = np.broadcast_to(np.asarray(stamp_ns, dtype=np.float64), (len(direction),))
+        pose = self.pose_at(stamps)
+        world_s = (stamps - self.origin_ns) * (1e-9 * self.speed)
+        origin = np.column_stack((_turned(origin_m, pose[:, 2])[:, :2] + pose[:, :2], origin_m[:, 2]))
+        return self.world.ray_distances(origin, _turned(direction, pose[:, 2]), world_s, range_max_m=range_max_m)
+
+    def floor_m(self, mount: Mount, now_ns: int) -> float:
+        """See `contact.GroundScene`."""
+        x, y = _mounted(self._pose_now(now_ns), mount)[0]
+        return self.world.floor_m((float(x), float(y)))
+
+    def drive_wheel(self, now_ns: int, side: Side, speed_m_s: float) -> None:
+        """See `wheel.DrivenScene`: motors drive a robot that is driven by commands; one on a route goes its way."""
+        self._wheel_m_s[side] = speed_m_s
+        if isinstance(self.motion, CommandedMotion):
+            self.begin_motion(now_ns)
+            left, right = self._wheel_m_s["left"], self._wheel_m_s["right"]
+            when_s = float(self.motion_s(np.array([float(now_ns)]))[0])
+            turn = (right - left) / self._track_width_m
+            self.motion.command(when_s, 0.5 * (left + right), turn, hold_s=UNTIL_TOLD_S)
+            self._newest_pose = self._newest_travel = None
+
     def _pose_now(self, now_ns: int) -> F64:
         """(1, 3); transducers that fire together share it."""
         if self._newest_pose is None or self._newest_pose[0] != now_ns:
@@ -413,6 +441,13 @@ class SimScene:
         if self.motion_ns is None:
             return np.zeros_like(stamp_ns)
         return (stamp_ns - self.motion_ns) * (1e-9 * self.speed)
+
+
+def _turned(vector: F64, yaw_rad: F64) -> F64:
+    """(N, 3) vectors turned about the vertical."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    x, y, z = vector.T
+    return np.stack((c * x - s * y, s * x + c * y, z), axis=-1)
 
 
 def _mounted(pose: F64, mount: Mount) -> F64:

@@ -3,6 +3,9 @@
 Everything is a segment or a circle with a material and a height. Distances are exact: no grid, no stepping. A beam
 has its own origin and its own moment, so a scan taken on the move is distorted as a real one is.
 
+A scanner that is tilted (a nodding mount) meets the same walls by their heights, and besides them the floor, pits in
+it, the ceiling, and the tops and undersides of furniture: `ray_distances`.
+
 Laser light: a wall answers. Glass answers only within a few degrees of the perpendicular and else lets the beam
 pass. Black answers only near by (farther at right angles) and swallows the beam beyond. People are two legs.
 Ultrasound: a surface answers where its nearest point within the cone is hit steeply enough (else the sound is
@@ -37,6 +40,8 @@ LEG_SWING_M = 0.25
 BODY_RADIUS_M = 0.22
 PERSON_HEIGHT_M = 1.8
 NOTHING_NEAR_M = 1e-9
+STEEPEST_LEVEL = 1e-9  # level share of a beam that goes straight up or down
+TABLE_TOP_M = 0.03
 TURN = 2.0 * math.pi
 
 
@@ -80,6 +85,31 @@ class Circles:
         return Circles(
             self.center[seen], self.radius_m[seen], self.material[seen], self.bottom_m[seen], self.top_m[seen]
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Plates:
+    """Level rectangles: center (P, 2), half_size_m (P, 2) along their own axes, yaw_rad (P,), z_m (P,).
+
+    Floor and ceiling reach everywhere. pits: rows of this table whose rectangle is a hole in the floor.
+    """
+
+    center: F64
+    half_size_m: F64
+    yaw_rad: F64
+    z_m: F64
+    is_pit: Bools
+
+    def hold(self, which: I64, point: F64) -> Bools:
+        """Whether points (N, 2) lie within plates which (N,)."""
+        off = point - self.center[which]
+        c, s = np.cos(self.yaw_rad[which]), np.sin(self.yaw_rad[which])
+        own = np.stack((c * off[:, 0] + s * off[:, 1], -s * off[:, 0] + c * off[:, 1]), axis=-1)
+        inside: Bools = np.all(np.abs(own) <= self.half_size_m[which], axis=1)
+        return inside
+
+
+NO_PLATES = Plates(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.bool_))
 
 
 class Walker:
@@ -146,6 +176,7 @@ class World:
     segments: Segments
     circles: Circles
     walkers: list[Walker] = field(default_factory=list)
+    plates: Plates = NO_PLATES
     _seen_at: dict[float, tuple[Segments, Circles]] = field(default_factory=dict)
     _bodies: tuple[float, F64] | None = None
 
@@ -153,7 +184,7 @@ class World:
     def from_plan(plan: FloorPlan, seed: int = 0) -> World:
         """Build the world of a floor plan; the seed moves the people only."""
         walkers = [Walker(w, seed * 1000 + i) for i, w in enumerate(plan.walkers)]
-        return World(_segments_of(plan), _circles_of(plan), walkers)
+        return World(_segments_of(plan), _circles_of(plan), walkers, _plates_of(plan))
 
     def beam_distances(self, origin: F64, heading_rad: F64, stamp_s: F64, *, z_m: float, range_max_m: float) -> F64:
         """Distances that beams of light travel to the first surface that answers; +inf if none up to range_max_m.
@@ -172,6 +203,34 @@ class World:
             rays.meet_people(self.walkers, stamp_s, range_max_m, answer)
         answer[(swallowed < answer) | (answer > range_max_m)] = np.inf
         return answer
+
+    def ray_distances(self, origin: F64, direction: F64, stamp_s: F64, *, range_max_m: float) -> F64:
+        """Distances that tilted beams travel to the first surface that answers; +inf if none up to range_max_m.
+
+        origin: (N, 3), direction: (N, 3) unit vectors, stamp_s: (N,): each beam has its own place and moment.
+        """
+        if not len(direction):
+            return np.zeros(0)
+        level = np.maximum(np.hypot(direction[:, 0], direction[:, 1]), STEEPEST_LEVEL)
+        tilt = _Tilt(origin[:, 2], direction[:, 2] / level, level)
+        rays = _Rays.of(origin[:, :2], np.arctan2(direction[:, 1], direction[:, 0]), tilt)
+        answer = np.full(len(direction), np.inf)
+        swallowed = np.full(len(direction), np.inf)
+        circles = self.circles
+        rays.meet_segments(self.segments, range_max_m, answer, swallowed)
+        rays.meet_circles(circles.center, circles.radius_m, range_max_m, answer, circles.bottom_m, circles.top_m)
+        rays.meet_people(self.walkers, stamp_s, range_max_m, answer)
+        rays.meet_plates(self.plates, answer)
+        rays.meet_floor_and_ceiling(self.plates, answer)
+        answer[swallowed < answer] = np.inf
+        distance = answer / level
+        return np.where(distance <= range_max_m, distance, np.inf)
+
+    def floor_m(self, place: Point) -> float:
+        """Height of the floor there: 0, or below in a pit."""
+        pits = np.flatnonzero(self.plates.is_pit)
+        inside = self.plates.hold(pits, np.broadcast_to(np.asarray(place, dtype=np.float64), (len(pits), 2)))
+        return float(np.min(self.plates.z_m[pits][inside], initial=0.0))
 
     def cone_distance(
         self,
@@ -226,6 +285,20 @@ class World:
 
 
 @dataclass(frozen=True, slots=True)
+class _Tilt:
+    """How beams leave the level: height at their origin, rise for each level metre, level share of their length."""
+
+    z_m: F64
+    climb: F64
+    level: F64
+
+    def misses(self, away: F64, beam: I64, bottom_m: F64 | float, top_m: F64 | float) -> Bools:
+        """Whether beams pass above or below something at level distances away (P,)."""
+        z = self.z_m[beam] + np.where(np.isfinite(away), away, 0.0) * self.climb[beam]
+        return (z < bottom_m) | (z > top_m)
+
+
+@dataclass(frozen=True, slots=True)
 class _Rays:
     """Beams, and what is needed to test each surface only against the beams that can meet it.
 
@@ -239,15 +312,16 @@ class _Rays:
     bearing: F64  # (N,) in that order, in [0, 2 pi)
     middle: F64
     spread_m: float
+    tilt: _Tilt | None = None
 
     @staticmethod
-    def of(origin: F64, heading_rad: F64) -> _Rays:
+    def of(origin: F64, heading_rad: F64, tilt: _Tilt | None = None) -> _Rays:
         direction = np.stack((np.cos(heading_rad), np.sin(heading_rad)), axis=-1)
         bearing = np.mod(heading_rad, TURN)
         order = np.argsort(bearing, kind="stable")
         middle = 0.5 * (origin.min(axis=0) + origin.max(axis=0))
         spread = float(np.hypot(*(origin - middle).T).max())
-        return _Rays(origin, direction, order, bearing[order], middle, spread)
+        return _Rays(origin, direction, order, bearing[order], middle, spread, tilt)
 
     def meet_segments(self, segments: Segments, range_max_m: float, answer: F64, swallowed: F64) -> None:
         """Lower `answer` to the nearest segment that answers each beam, `swallowed` to the nearest that takes it."""
@@ -263,6 +337,9 @@ class _Rays:
         start = from_rad + np.minimum(turn, 0.0)
         which, beam = self._pairs(start, np.abs(turn), nearest, range_max_m)
         away, cosine = self._along_segments(segments, which, beam)
+        if self.tilt is not None:
+            away[self.tilt.misses(away, beam, segments.bottom_m[which], segments.top_m[which])] = np.inf
+            cosine = cosine * self.tilt.level[beam]
         material = segments.material[which]
         away[(material == GLASS) & (cosine < math.cos(GLASS_ANSWERS_WITHIN_RAD))] = np.inf
         black = (material == BLACK) & (away > BLACK_REACH_M * cosine)
@@ -271,10 +348,20 @@ class _Rays:
             away[black] = np.inf
         np.minimum.at(answer, beam, away)
 
-    def meet_circles(self, center: F64, radius_m: F64, range_max_m: float, answer: F64) -> None:
-        """Lower `answer` to the nearest circle."""
+    def meet_circles(
+        self,
+        center: F64,
+        radius_m: F64,
+        range_max_m: float,
+        answer: F64,
+        bottom_m: F64 | None = None,
+        top_m: F64 | None = None,
+    ) -> None:
+        """Lower `answer` to the nearest circle. bottom_m, top_m: for tilted beams."""
         which, beam = self._pairs_with_circles(center, radius_m, range_max_m)
         hit = _ray_circle(self.origin[beam], self.direction[beam], center[which], radius_m[which])
+        if self.tilt is not None and bottom_m is not None and top_m is not None:
+            hit[self.tilt.misses(hit, beam, bottom_m[which], top_m[which])] = np.inf
         np.minimum.at(answer, beam, hit)
 
     def meet_people(self, walkers: Sequence[Walker], stamp_s: F64, range_max_m: float, answer: F64) -> None:
@@ -286,7 +373,37 @@ class _Rays:
             if len(beam):
                 for leg in walker.legs(stamp_s[beam]):
                     hit = _ray_circle(self.origin[beam], self.direction[beam], leg, LEG_RADIUS_M)
+                    if self.tilt is not None:
+                        hit[self.tilt.misses(hit, beam, 0.0, PERSON_HEIGHT_M)] = np.inf
                     np.minimum.at(answer, beam, hit)
+
+    def meet_plates(self, plates: Plates, answer: F64) -> None:
+        """Lower `answer` to the nearest level plate that a tilted beam meets, from above or from below."""
+        assert self.tilt is not None
+        for k in np.flatnonzero(~plates.is_pit):
+            away = self._level_m(float(plates.z_m[k]))
+            met = np.flatnonzero(away < answer)
+            point = self.origin[met] + away[met, None] * self.direction[met]
+            met = met[plates.hold(np.full(len(met), k), point)]
+            answer[met] = away[met]
+
+    def meet_floor_and_ceiling(self, plates: Plates, answer: F64) -> None:
+        """Lower `answer` to the floor, or the ground of the pit that a beam falls into, and to the ceiling."""
+        np.minimum(answer, self._level_m(CEILING_M), out=answer)
+        away = self._level_m(0.0)
+        point = self.origin + np.where(np.isfinite(away), away, 0.0)[:, None] * self.direction
+        for k in np.flatnonzero(plates.is_pit):
+            falls = np.flatnonzero(plates.hold(np.full(len(point), k), point))
+            away[falls] = self._level_m(float(plates.z_m[k]))[falls]
+        np.minimum(answer, away, out=answer)
+
+    def _level_m(self, z_m: float) -> F64:
+        """(N,) level distances at which beams are at this height; +inf where they never are."""
+        assert self.tilt is not None
+        rise = z_m - self.tilt.z_m
+        level = np.abs(self.tilt.climb) < 1e-12
+        away = rise / np.where(level, 1.0, self.tilt.climb)
+        return np.where(level | (away <= 0.0), np.inf, away)
 
     def _pairs_with_circles(self, center: F64, radius_m: F64, range_max_m: float) -> tuple[I64, I64]:
         to_center = center - self.middle
@@ -444,6 +561,10 @@ def _segments_of(plan: FloorPlan) -> Segments:
         swung = math.radians(door.closed_deg + door.open_deg)
         tip = (door.hinge[0] + door.width_m * math.cos(swung), door.hinge[1] + door.width_m * math.sin(swung))
         rows += _faces(_slab(door.hinge, tip, door.thickness_m, overlap=False), door.material, 0.0, CEILING_M)
+    for pit in plan.pits:
+        around = _corners(pit.center, pit.size_m, pit.yaw_deg)
+        for a, b in zip(around, around[1:] + around[:1]):
+            rows += _faces([a, b], "wall", -pit.depth_m, -0.001)  # a level sensor on the floor does not see it
     for box in plan.boxes:
         rows += _faces(_corners(box.center, box.size_m, box.yaw_deg), box.material, box.bottom_m, box.top_m)
     return Segments(
@@ -490,6 +611,26 @@ def _corners(center: Point, size_m: Point, yaw_deg: float) -> list[Point]:
     c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
     half = [(sx * size_m[0] / 2.0, sy * size_m[1] / 2.0) for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
     return [(center[0] + c * x - s * y, center[1] + s * x + c * y) for x, y in half]
+
+
+def _plates_of(plan: FloorPlan) -> Plates:
+    """Tops and undersides of boxes and tables, and pits."""
+    rows: list[tuple[Point, Point, float, float, bool]] = []
+    for box in plan.boxes:
+        rows.append((box.center, box.size_m, box.yaw_deg, box.top_m, False))
+        if box.bottom_m > 0.0:
+            rows.append((box.center, box.size_m, box.yaw_deg, box.bottom_m, False))
+    for table in plan.tables:
+        for z_m in (table.top_m, table.top_m - TABLE_TOP_M):
+            rows.append((table.center, table.size_m, table.yaw_deg, z_m, False))
+    rows += [(pit.center, pit.size_m, pit.yaw_deg, -pit.depth_m, True) for pit in plan.pits]
+    return Plates(
+        np.array([r[0] for r in rows], dtype=np.float64).reshape(-1, 2),
+        0.5 * np.array([r[1] for r in rows], dtype=np.float64).reshape(-1, 2),
+        np.radians(np.array([r[2] for r in rows], dtype=np.float64)),
+        np.array([r[3] for r in rows], dtype=np.float64),
+        np.array([r[4] for r in rows], dtype=np.bool_),
+    )
 
 
 def _circles_of(plan: FloorPlan) -> Circles:
