@@ -31,7 +31,7 @@ _TRIM_SIGMAS = 2.5
 _TRIM_SHARE = 4  # at most a quarter of a run is trimmed from each end
 
 
-# ------------------------------------------------------------------------------------------------------ S03 segmentation
+# ----------------------------------------------------------------------------------------------------- S03 segmentation
 
 
 @njit(cache=True, nogil=True)
@@ -358,9 +358,8 @@ def lines_of_points(x: Any, y: Any, beam: Any, n: int, full_turn: bool, spacing:
     """
     if n < 2:
         return 0
-    closed = False
     if full_turn:
-        cut, closed = seam(x, y, n, rules[GAP_M], spacing)
+        cut, _ring = seam(x, y, n, rules[GAP_M], spacing)
         x, y, beam = turned(x, n, cut), turned(y, n, cut), turned(beam, n, cut)
     label = np.empty(n, np.int64)
     clusters = segment(x, y, n, rules[GAP_M], spacing, int(rules[SMALLEST]), label)
