@@ -3,8 +3,7 @@
     11-bit id = node << 5 | command, little-endian; a value is asked for by a remote frame of its id
 
     01   heartbeat, each 100 ms    axis error u32, state u8; 0.5.x: bit 0 of bytes 5, 6, 7 motor, encoder, controller
-                                   error;
-                                   0.6.x: byte 5 result of the last procedure, byte 6 bit 0 trajectory done
+                                   error; 0.6.x: byte 5 result of the last procedure, byte 6 bit 0 trajectory done
     09   encoder estimates         position f32 in turns, speed f32 in turns/s; sent each 10 ms, or when asked
     0A   encoder count (0.5.x)     running count i32, count within one turn i32; when asked
 
