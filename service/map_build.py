@@ -44,6 +44,7 @@ BEFORE_END_M = 0.20
 class PoseSource(StrEnum):
     """Where the robot's poses come from."""
 
+    SLAM = "slam"
     LOG = "log"
     ODOMETRY = "odometry"
 
@@ -60,7 +61,7 @@ class HoldOut:
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """A finished map. robot_poses: (N, 3) x, y, yaw in the map frame, one a scan."""
+    """A finished map. robot_poses: (N, 3) x, y, yaw in the map frame, one a scan.  slam: figures of SLAM, if it ran."""
 
     log: Log
     scans: Sequence[LogScan]
@@ -69,6 +70,7 @@ class Built:
     inserted: int
     hold_out: HoldOut | None
     seconds: dict[str, float]
+    slam: dict[str, object] | None = None
 
 
 def build(
@@ -96,7 +98,14 @@ def build(
     if not scans:
         raise WrongUsage(f"{path}: holds no laser scan")
     read = time.monotonic()
-    robot_poses = poses_from_log(log, scans, poses)
+    slam: dict[str, object] | None = None
+    if poses is PoseSource.SLAM:
+        from service.slam_log import run_slam
+
+        run = run_slam(log, scans, progress=progress)
+        robot_poses, slam = run.robot_poses, run.figures
+    else:
+        robot_poses = poses_from_log(log, scans, poses)
     localised = time.monotonic()
     grid = OccupancyGrid(resolution_m=resolution_m, model="counters" if model == "counters" else "log-odds")
     held = set(range(0, len(scans), hold_out)) if hold_out else set()
@@ -106,6 +115,7 @@ def build(
     return Built(
         log, scans, robot_poses, grid, len(scans) - len(held), judged,
         {"read": read - started, "localise": localised - read, "map": mapped - localised},
+        slam,
     )  # fmt: skip
 
 
@@ -238,6 +248,8 @@ def report_of(built: Built, patch: GridPatch, source: PoseSource) -> dict[str, o
         "seconds": {name: round(value, 3) for name, value in built.seconds.items()},
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1),
     }
+    if built.slam is not None:
+        report["slam"] = built.slam
     if built.hold_out is not None:
         report["hold_out"] = {
             "scans": built.hold_out.scans,

@@ -29,6 +29,7 @@ class Model(StrEnum):
 class Poses(StrEnum):
     """Where the poses of a log's scans come from."""
 
+    SLAM = "slam"
     LOG = "log"
     ODOMETRY = "odometry"
 
@@ -211,8 +212,9 @@ def build(
     *,
     out: Annotated[Path, typer.Option(help="Folder for the results; made if absent.")],
     poses: Annotated[
-        Poses, typer.Option(help="log: as the log has them; odometry: only if they are odometry.")
-    ] = Poses.LOG,
+        Poses,
+        typer.Option(help="slam: found from the scans; log: as the log has them; odometry: only if they are odometry."),
+    ] = Poses.SLAM,
     every: Annotated[int, typer.Option(min=1, help="Use every N-th scan.")] = 1,
     hold_out: Annotated[int, typer.Option(min=0, help="Keep every N-th scan back and judge the grid by it.")] = 0,
     resolution: Annotated[float, typer.Option(min=0.005, max=1.0, help="Metres a cell.")] = 0.05,
