@@ -9,20 +9,30 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from sim_devices.attach import Attachment, PtyLink
-from sim_devices.device import CanDevice, Mount, Scene
+from sim_devices.device import ByteDevice, CanDevice, Mount, Scene
+from sim_devices.encoder_arduino_bridge import ArduinoBridge
 from sim_devices.encoder_cia406 import Cia406Encoder
+from sim_devices.encoder_odrive import ODriveAxis
+from sim_devices.encoder_roboclaw import RoboClaw
+from sim_devices.encoder_vesc import STEPS_PER_ELECTRICAL_TURN, Vesc
 from sim_devices.faults import FaultPlan
 from sim_devices.laser_hokuyo import PROFILES, UTM_30LX, HokuyoLaser, LaserProfile
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardCan, default_parameters
+from sim_devices.wheel import Side, Wheel
 
 Table = dict[str, Any]
+
+SIDES: tuple[Side, Side] = ("left", "right")
+WHEEL_BOARDS = frozenset({"arduino-bridge", "roboclaw"})  # one board on a serial line counts both wheels
+FIRST_NODE = {"cia406": 0x20, "odrive": 0, "vesc": 1}  # one node a wheel on a CAN bus
+WHEEL_DRIVERS = WHEEL_BOARDS | FIRST_NODE.keys()
 
 HOST = "host"  # the daemon's adapter on every bus
 INLINE_TABLES = frozenset({"mount", "pose", "tls"})
@@ -134,28 +144,60 @@ class _Builder:
         self.robot.sonars[name] = board
 
     def add_wheels(self, name: str, wheels: Table) -> None:
-        place = f"wheels.{name}"
-        _require(wheels, place, "cia406")
-        drive = self.robot.config.get("drive", {})
-        bus = _bus_of(self.robot, wheels, place)
+        driver = _required(wheels, f"wheels.{name}", WHEEL_DRIVERS)
         alone = len(self.robot.config["wheels"]) == 1
-        for side, default in (("left", 0x20), ("right", 0x21)):
-            node = int(wheels.get(f"node_{side}", default))
-            ticks = float(drive.get(f"ticks_per_turn_{side}", 4096.0))
-            steps = max(1, round(abs(ticks)))
-            target = f"encoder.{side}" if alone else f"encoder.{name}.{side}"
-            encoder = Cia406Encoder(
-                self._seen(target),
-                node,
-                wheel="left" if side == "left" else "right",
-                wheel_radius_m=float(drive.get(f"wheel_radius_{side}_m", 0.10)),
-                steps_per_turn=steps,
-                gear=abs(ticks) / steps,
-                sign=1 if ticks > 0 else -1,
-                serial=4700 + node,
-            )
-            self._join(bus, target, encoder)
-            self.robot.encoders[f"{name}.{side}"] = encoder
+        target = "encoder" if alone else f"encoder.{name}"
+        if driver in WHEEL_BOARDS:
+            board = self._wheel_board(driver, wheels, target)
+            self._attach_serial(f"wheels.{name}", wheels, target, board)
+            return
+        bus = _bus_of(self.robot, wheels, f"wheels.{name}")
+        for number, side in enumerate(SIDES):
+            node = self._wheel_node(driver, wheels, number, f"{target}.{side}")
+            self._join(bus, f"{target}.{side}", node)
+            if isinstance(node, Cia406Encoder):
+                self.robot.encoders[f"{name}.{side}"] = node
+
+    def _wheel_board(self, driver: str, wheels: Table, target: str) -> ArduinoBridge | RoboClaw:
+        left, right = (self._wheel(side, self._seen(target)) for side in SIDES)
+        if driver == "roboclaw":
+            return RoboClaw(left, right, address=int(wheels.get("address", 0x80)))
+        return ArduinoBridge(left, right, baud_bps=int(wheels.get("baud_bps", 57600)))
+
+    def _wheel_node(self, driver: str, wheels: Table, number: int, target: str) -> CanDevice:
+        side = SIDES[number]
+        wheel = self._wheel(side, self._seen(target))
+        ticks, sign = abs(wheel.ticks_per_turn), 1 if wheel.ticks_per_turn > 0 else -1
+        node = int(wheels.get(f"node_{side}", FIRST_NODE[driver] + number))
+        if driver == "odrive":
+            cpr = int(wheels.get("cpr", 8192))
+            generation = "0.5" if str(wheels.get("firmware", "0.6")).startswith("0.5") else "0.6"
+            return ODriveAxis(wheel, node, generation=generation, gear=ticks / cpr, sign=sign, cpr=cpr)
+        if driver == "vesc":  # a tick is a step of the tachometer
+            return Vesc(wheel, node, pole_pairs=1, gear=ticks / STEPS_PER_ELECTRICAL_TURN, sign=sign)
+        steps = max(1, round(ticks))
+        return Cia406Encoder(
+            wheel.scene,
+            node,
+            wheel=side,
+            wheel_radius_m=wheel.radius_m,
+            steps_per_turn=steps,
+            gear=ticks / steps,
+            sign=sign,
+            serial=4700 + node,
+        )
+
+    def _wheel(self, side: Side, scene: Scene) -> Wheel:
+        drive = self.robot.config.get("drive", {})
+        radius_m = float(drive.get(f"wheel_radius_{side}_m", 0.10))
+        return Wheel(scene, side, radius_m, float(drive.get(f"ticks_per_turn_{side}", 4096.0)))
+
+    def _attach_serial(self, station: str, table: Table, target: str, device: ByteDevice) -> None:
+        """Put a device on a pty of its own and its name into the configuration."""
+        link = PtyLink(self.folder / station.replace(".", "-"))
+        self.attachment.add(station, self.plan.device(target, device) if self.faulty else device, link)
+        self.robot.links[station] = link
+        table["port"] = str(link.path)
 
     def _seen(self, target: str) -> Scene:
         return self.plan.scene(target, self.scene) if self.faulty else self.scene
@@ -169,6 +211,13 @@ def _bus_of(robot: Robot, device: Table, place: str) -> CanBus:
     if name not in robot.buses:
         raise PresetError(f"{place}.can: there is no [can.{name}]")
     return robot.buses[name].bus
+
+
+def _required(device: Table, place: str, drivers: Collection[str]) -> str:
+    driver = device.get("driver")
+    if driver not in drivers:
+        raise PresetError(f"{place}.driver: {', '.join(sorted(drivers))} can be emulated here, not {driver!r}")
+    return str(driver)
 
 
 def _require(device: Table, place: str, driver: str) -> None:
