@@ -10,7 +10,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from service.config import Config, HokuyoLaser, Loaded, load
+from service.config import Config, HokuyoLaser, Loaded, UsBoardSonars, load
 from service.config_files import daemon_endpoint, find_config, lines_of_keys
 from service.config_text import EXAMPLE, effective_values, reference
 from service.errors import WrongUsage
@@ -95,7 +95,9 @@ def test_the_configuration_of_the_architecture_page_is_valid(tmp_path: Path) -> 
     page = (ROOT / "docs/architecture.md").read_text()
     config = load_text(tmp_path, page.split("```toml")[1].split("```")[0]).config
     assert config.robot.id == "artos"
-    assert config.sonars["front"].base_id == 0x400
+    chain = config.sonars["front"]
+    assert isinstance(chain, UsBoardSonars)
+    assert chain.base_id == 0x400
 
 
 @pytest.mark.parametrize(
