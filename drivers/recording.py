@@ -157,7 +157,8 @@ class WirePlayer:
 
     def __init__(self, conversations: Mapping[str, Conversation[Any]]) -> None:
         self._conversations = dict(conversations)
-        self._broken: set[str] = set()  # after an exception, left alone until begun anew, as the reader does
+        self._silent = set(conversations)  # not begun in this recording yet: it began while they were running
+        self._broken: set[str] = set(conversations)  # left alone until begun anew, as the reader does after a bug
         self._expected: list[Item] = []
         self._surplus = 0
         self.sent = 0
@@ -195,7 +196,7 @@ class WirePlayer:
         if self._expected and self._expected[0] == item:
             self._expected.pop(0)
             self.sent += 1
-        else:  # what is sent after the last turn of all is the farewell
+        elif not self._silent:  # what is sent after the last turn of all is the farewell
             self._surplus += 1
 
     def _receive(self, source: str, item: bytes | CanFrame, stamp_ns: int) -> Iterator[tuple[str, Reading]]:
@@ -213,6 +214,7 @@ class WirePlayer:
         if conversation is None:
             return
         self._broken.discard(source)
+        self._silent.discard(source)
         try:
             conversation.connected(now_ns)
         except Exception as error:

@@ -293,13 +293,14 @@ class Files:
         self._lost_here = 0
 
     def _newest_ns(self, things: Iterable[Thing]) -> int:
-        newest = self._last_ns
+        """The time by what is written: nobody here asks a clock."""
         for thing in things:
-            if isinstance(thing, tuple):
-                newest = max(newest, thing[0])
-            elif isinstance(thing, Published):
-                newest = max(newest, thing.now_ns)
-        return newest
+            match thing:
+                case WireItem(_, record):
+                    self._last_ns = max(self._last_ns, record.stamp_ns)
+                case Published(_, now_ns) | (now_ns, _, _, _):
+                    self._last_ns = max(self._last_ns, now_ns)
+        return self._last_ns
 
 
 def make_room(settings: Settings, keep: Path) -> None:
