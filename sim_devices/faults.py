@@ -24,8 +24,8 @@ active for its name. What is wrapped does not know:
 
 A host's slcan adapter is a serial device too: station.wrap_member(name, plan.device("can.daemon", adapter)).
 `KINDS` lists all kinds. A device that carries faults out inside itself has `fault_family` and `inflict` (wheel.Faulty);
-lasers may have set_speed_share, set_clock_drift, trouble and points_left_out. Faults may be started and ended while
-everything runs, in the loop's thread (Attachment.post).
+lasers may have set_speed_share, set_clock_drift and trouble. Faults may be started and ended while everything runs, in
+the loop's thread (Attachment.post).
 """
 
 from __future__ import annotations
@@ -101,7 +101,9 @@ KINDS: dict[str, Kind] = {
     "clock_drift": Kind("laser", "the device's clock runs so many ppm fast", 500.0),
     "speed": Kind("laser", "the head turns at this share of its speed", 0.95),
     "varying_speed": Kind("laser", "the head's speed swings by this share to both sides, every `period_s` (4)", 0.1),
-    "varying_count": Kind("points", "share of the points of each turn, at random, that the laser leaves out", 0.1),
+    "varying_count": Kind(
+        "laser", "the head's speed jumps by up to this share: turns have unlike numbers of beams", 0.1
+    ),
     "trouble": Kind("laser", "hardware trouble under this status (50 to 97)", 51),
     # what sonars meet
     "stuck": Kind("sonar", "`channel` (all, if none) always reads this many metres", 0.5),
@@ -524,9 +526,7 @@ SWING_STEP_NS = 100_000_000  # between two speeds of a head whose speed swings
 
 def _families(device: object) -> list[str]:
     """Which of the kinds' families a device belongs to."""
-    found = ["points"] if hasattr(device, "points_left_out") else []
-    if isinstance(device, Faulty):
-        found.append(device.fault_family)
+    found = [device.fault_family] if isinstance(device, Faulty) else []
     if hasattr(device, "set_speed_share"):
         found.append("laser")
     if isinstance(device, UsBoardCan | UsBoardSerial):
@@ -568,18 +568,18 @@ class _Knobs:
 
     def _swing(self, active: Sequence[Fault], now_ns: int) -> None:
         """A head whose speed swings gets another speed now and then."""
-        swinging = next((fault for fault in active if fault.kind == "varying_speed"), None)
+        swinging = next((fault for fault in active if fault.kind in ("varying_speed", "varying_count")), None)
         if swinging is None:
             self._swing_ns = None
         elif self._swing_ns is None or now_ns >= self._swing_ns:
             since_s = (self._plan.now_ns(now_ns) - swinging.start_ns) / SECOND_NS
-            share = 1.0 + swinging.value * math.sin(2.0 * math.pi * since_s / swinging.argument("period_s", 4.0))
-            _call(self._device, "set_speed_share", share, now_ns)
+            off = math.sin(2.0 * math.pi * since_s / swinging.argument("period_s", 4.0))
+            if swinging.kind == "varying_count":
+                off = float(self._plan.random(self._target, max(0, now_ns)).uniform(-1.0, 1.0))
+            _call(self._device, "set_speed_share", 1.0 + swinging.value * off, now_ns)
             self._swing_ns = now_ns + SWING_STEP_NS
 
     def _turn(self, fault: Fault, now_ns: int) -> Undo | None:
-        if fault.kind == "varying_count" and hasattr(self._device, "points_left_out"):
-            return _set(self._device, "points_left_out", fault.value)
         if isinstance(self._device, Faulty):
             return self._device.inflict(fault.kind, fault.value, fault.arguments, now_ns)
         if hasattr(self._device, "set_speed_share"):
@@ -609,7 +609,7 @@ def _turn_laser(laser: object, fault: Fault, now_ns: int) -> Undo | None:
         return lambda then_ns: _call(laser, "set_clock_drift", before_ppm, then_ns)
     if fault.kind == "speed":
         _call(laser, "set_speed_share", fault.value, now_ns)
-    if fault.kind in ("speed", "varying_speed"):
+    if fault.kind in ("speed", "varying_speed", "varying_count"):
         return lambda then_ns: _call(laser, "set_speed_share", 1.0, then_ns)
     if fault.kind == "trouble":
         _call(laser, "trouble", f"{round(fault.value):02d}", now_ns)
