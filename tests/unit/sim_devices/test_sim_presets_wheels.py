@@ -1,0 +1,148 @@
+"""Wheel boards of a configuration: on their wires, counting as the configuration says, with their faults."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from sim_devices.attach import Attachment, MemoryLink
+from sim_devices.faults import FaultPlan
+from sim_devices.floor_plan import FloorPlan
+from sim_devices.presets import PresetError, Robot, emulate
+from sim_devices.robot import CommandedMotion, SimScene, Trajectory, twist
+from sim_devices.world import World
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+
+
+def config(**wheels: Any) -> dict[str, Any]:
+    return {
+        "robot": {"id": "two"},
+        "drive": {
+            "source": "drive",
+            "wheel_radius_left_m": 0.1,
+            "wheel_radius_right_m": 0.1,
+            "ticks_per_turn_left": 2000.0,
+            "ticks_per_turn_right": -2000.0,
+        },
+        "can": {"main": {"bitrate_bps": 250000}},
+        "wheels": {"drive": wheels},
+    }
+
+
+def straight() -> SimScene:
+    """One metre a second, three metres far: 3 / (2 pi 0.1) turns, 9549.3 ticks."""
+    return SimScene(World.from_plan(FloorPlan()), Trajectory((0.0, 0.0, 0.0), [twist(1.0, 0.0, 3.0)]))
+
+
+TICKS = 3.0 / (2.0 * math.pi * 0.1) * 2000.0
+
+
+def stage(tmp_path: Path, *faults: str, **wheels: Any) -> tuple[Attachment, Robot]:
+    attachment = Attachment(clock=lambda: 0)
+    plan = FaultPlan(faults) if faults else None
+    robot = emulate(config(**wheels), straight(), attachment, tmp_path, plan=plan)
+    assert plan is None or plan.complaints() == []
+    return attachment, robot
+
+
+def ask(attachment: Attachment, port: serial.Serial, command: bytes, at_ns: int) -> bytes:
+    port.write(command)
+    for later_ns in range(0, 60 * MS, MS):
+        attachment.service(at_ns + later_ns)
+    return bytes(port.read(4096))
+
+
+@pytest.mark.parametrize(("fault", "left"), [("", 1.0), ("encoder:missed_counts=0.5(side=1)", 0.5)])
+def test_arduino_board_on_a_pty(tmp_path: Path, fault: str, left: float) -> None:
+    attachment, robot = stage(tmp_path, *([fault] if fault else []), driver="arduino-bridge")
+    try:
+        attachment.service(0)
+        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=0) as port:
+            assert ask(attachment, port, b"b\r", 2 * SECOND) == b"57600\r\n"
+            counts = ask(attachment, port, b"e\r", 10 * SECOND).split()
+            assert int(counts[0]) == pytest.approx(left * TICKS, abs=2)
+            assert int(counts[1]) == pytest.approx(-TICKS, abs=2)
+    finally:
+        attachment.stop()
+
+
+def test_roboclaw_on_a_pty(tmp_path: Path) -> None:
+    attachment, robot = stage(tmp_path, driver="roboclaw", address=0x81)
+    try:
+        attachment.service(0)
+        with serial.Serial(robot.config["wheels"]["drive"]["port"], 115200, timeout=0) as port:
+            counts = ask(attachment, port, b"\x81\x4e", 10 * SECOND)
+            assert int.from_bytes(counts[:4], "big") == pytest.approx(TICKS, abs=2)
+            assert int.from_bytes(counts[4:8], "big", signed=True) == pytest.approx(-TICKS, abs=2)
+            assert ask(attachment, port, b"\x80\x4e", 11 * SECOND) == b""
+    finally:
+        attachment.stop()
+
+
+@pytest.mark.parametrize(
+    ("wheels", "ids"),
+    [
+        ({"driver": "odrive", "node_left": 3, "node_right": 4, "firmware": "0.5.6"}, (0x06A, 0x08A)),
+        ({"driver": "vesc", "node_left": 10, "node_right": 11}, (0x1B0A, 0x1B0B)),
+    ],
+)
+def test_nodes_on_a_bus(tmp_path: Path, wheels: dict[str, Any], ids: tuple[int, int]) -> None:
+    attachment, robot = stage(tmp_path, can="main", **wheels)
+    link = MemoryLink()
+    robot.buses["main"].add_member("spy", link)
+    try:
+        attachment.service(0)
+        link.host_write(b"S5\rO\r")
+        for at_ms in range(0, 10_000, 20):
+            attachment.service(at_ms * MS)
+        link.host_read()
+        little = wheels["driver"] == "odrive"
+        if little:
+            link.host_write(b"".join(b"r%03X8\r" % can_id for can_id in ids))
+        for at_ms in range(10_000, 10_050, 5):
+            attachment.service(at_ms * MS)
+        seen = {}
+        for line in link.host_read().split(b"\r"):
+            digits = {b"t": 3, b"T": 8}.get(line[:1])
+            if digits:
+                data = bytes.fromhex(line[digits + 2 :].decode())
+                seen[int(line[1 : digits + 1], 16)] = int.from_bytes(
+                    data[:4], "little" if little else "big", signed=True
+                )
+        assert seen[ids[0]] == pytest.approx(TICKS, abs=3)
+        assert seen[ids[1]] == pytest.approx(-TICKS, abs=3)
+    finally:
+        attachment.stop()
+
+
+def test_hosts_commands_drive_a_robot_without_a_route(tmp_path: Path) -> None:
+    scene = SimScene(World.from_plan(FloorPlan()), CommandedMotion((0.0, 0.0, 0.0)), begin_at_origin=False)
+    attachment = Attachment(clock=lambda: 0)
+    table = config(driver="arduino-bridge")
+    table["drive"]["ticks_per_turn_right"] = 2000.0
+    robot = emulate(table, scene, attachment, tmp_path, plan=FaultPlan(["encoder:slip=0.0"]))
+    try:
+        attachment.service(0)
+        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=0) as port:
+            assert ask(attachment, port, b"m 20 20\r", 2 * SECOND) == b"OK\r\n"
+            for at_ns in range(2 * SECOND, 5 * SECOND, 20 * MS):
+                attachment.service(at_ns)
+            # 600 ticks a second for two seconds
+            assert scene.pose_at([6 * SECOND])[0, 0] == pytest.approx(1200 / 2000 * 2 * math.pi * 0.1, abs=0.02)
+    finally:
+        attachment.stop()
+
+
+def test_unknown_wheels_say_what_there_is(tmp_path: Path) -> None:
+    attachment = Attachment(clock=lambda: 0)
+    try:
+        with pytest.raises(PresetError, match="roboclaw"):
+            emulate(config(driver="steam"), straight(), attachment, tmp_path)
+    finally:
+        attachment.stop()
