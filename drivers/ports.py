@@ -80,17 +80,32 @@ class SerialPort:
     """A serial line, 8N1, locked against a second program that asks for the lock too (pyserial's flock).
 
     Pseudo terminals are welcome: what they lack (modem lines, low latency flag) is skipped.
+    dtr: level of the line DTR while open (default: on).  dtr_at_close: level to leave it at; by default the system
+    switches it off. On an RPLIDAR A1 it stops the motor.
     """
 
     silence_reopen_s: float | None = None  # reopening resets boards that watch DTR, so silence alone is no reason
 
-    def __init__(self, path: str, *, baud: int = 115200, clock: Clock, write_timeout_s: float = 0.25) -> None:
+    def __init__(
+        self,
+        path: str,
+        *,
+        baud: int = 115200,
+        clock: Clock,
+        write_timeout_s: float = 0.25,
+        dtr: bool = True,
+        dtr_at_close: bool | None = None,
+    ) -> None:
         self.name = path
         self.drops: dict[str, int] = {}
         self._clock = clock
         self._write_timeout_ns = int(write_timeout_s * 1e9)
+        self._dtr_at_close = dtr_at_close
         try:
-            self._serial = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
+            self._serial = serial.Serial(None, baud, timeout=0, write_timeout=0, exclusive=True)
+            self._serial.port = path
+            self._serial.dtr = dtr  # set on opening, where there is such a line
+            self._serial.open()
         except (OSError, ValueError, termios.error) as error:  # serial.SerialException is an OSError
             raise _opening_failed(path, error) from error
         self._fd = self._serial.fileno()
@@ -156,11 +171,22 @@ class SerialPort:
         with contextlib.suppress(OSError, termios.error):
             if not self._drain(self._clock() + self._write_timeout_ns):
                 termios.tcflush(self._fd, termios.TCOFLUSH)  # else close itself may wait 30 s
+        if self._dtr_at_close is not None:
+            self._leave_dtr(self._dtr_at_close)
         with contextlib.suppress(OSError, termios.error):
             self._serial.close()
 
     def fileno(self) -> int:
         return self._fd
+
+    def _leave_dtr(self, level: bool) -> None:
+        """The system lowers modem lines on closing, unless told not to."""
+        with contextlib.suppress(OSError, termios.error):
+            settings = termios.tcgetattr(self._fd)
+            settings[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._fd, termios.TCSANOW, settings)
+        with contextlib.suppress(OSError, termios.error):
+            self._serial.dtr = level
 
     def _await_writable(self, deadline_ns: int) -> None:
         left_ms = (deadline_ns - self._clock()) / 1e6
@@ -420,7 +446,8 @@ def _errno_of(error: BaseException) -> int | None:
     """The system's error number, wherever python-can or pyserial left it."""
     seen: BaseException | None = error
     while seen is not None:
-        for value in (getattr(seen, "errno", None), getattr(seen, "error_code", None)):
+        first = seen.args[0] if isinstance(seen, termios.error) and seen.args else None  # it has no errno
+        for value in (getattr(seen, "errno", None), getattr(seen, "error_code", None), first):
             if isinstance(value, int):
                 return value
         seen = seen.__cause__ or seen.__context__

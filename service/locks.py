@@ -26,12 +26,14 @@ class Claims:
     def claim_ports(self, ports: Iterable[str]) -> None:
         """Take serial ports for this daemon; Trouble names the process that has one already, and the repair."""
         for port in ports:
-            self._claim(
-                "port",
-                os.path.realpath(port),
-                f"{port} is in use by another umfeld daemon (process {{pid}}): stop that one, or give this "
-                "configuration a port of its own",
-            )
+            # Under its own name too: a daemon that waits for its device claims it before the link leads anywhere.
+            for name in {os.path.abspath(port): None, os.path.realpath(port): None}:
+                self._claim(
+                    "port",
+                    name,
+                    f"{port} is in use by another umfeld daemon (process {{pid}}): stop that one, or give this "
+                    "configuration a port of its own",
+                )
 
     def claim_store(self, path: Path) -> None:
         """Take the file of a map."""

@@ -41,6 +41,7 @@ OCCUPANCY = "occupancy"
 
 _GENERATIONS = 2
 _WAL_PAGES = 1000
+_SQLITE_HEAD = b"SQLite format 3\0"
 _BUSY_MS = 2000
 Tile = tuple[int, int, bytes]
 
@@ -551,12 +552,19 @@ def _repair(path: Path) -> str:
     problem = check_file(path)
     if problem is None or "not a map of umfeld" in problem or "newer umfeld" in problem:
         return ""
+    if "is locked" in problem:  # it is whole, but not ours to look at now
+        raise StoreInUse(
+            f"{path}: another program has locked this map: close it (`fuser -v {path}` names it), or set another "
+            "[store] path"
+        )
+    if not _was_ours(path):
+        raise StoreTrouble(f"{path}: is not a map of umfeld; move it away, or set another [store] path")
     aside = _free_name(path)
     for suffix in ("", "-wal", "-shm"):
         part = path.with_name(path.name + suffix)
         if part.exists():
             part.replace(aside.with_name(aside.name + suffix))
-    text = f"{path.name} was damaged ({problem}) and is kept as {aside.name}; "
+    text = f"{path} was damaged ({problem.removeprefix(f'{path}: ')}) and is kept as {aside.name}; "
     for number in range(1, _GENERATIONS + 1):
         generation = generation_path(path, number)
         if generation.exists() and check_file(generation) is None:
@@ -567,8 +575,14 @@ def _repair(path: Path) -> str:
     else:
         text += "no sound generation was found, the map begins empty"
         sync(path.parent)
-    _LOG.error("%s", text)
     return text
+
+
+def _was_ours(path: Path) -> bool:
+    """Whether a file that cannot be read was a map: it begins as databases do, or has generations beside it."""
+    with path.open("rb") as file:
+        head = file.read(len(_SQLITE_HEAD))
+    return head == _SQLITE_HEAD or generation_path(path, 1).exists()
 
 
 def _free_name(path: Path) -> Path:
