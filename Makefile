@@ -45,7 +45,7 @@ hil: venv  ## Driver tests on hardware: make hil DEVICE=laser=/dev/ttyACM0 (docs
 
 fuzz: venv  ## Damaged bytes and random scenes, far more than `make test` tries
 	UMFELD_FUZZ_CASES=$(FUZZ_CASES) $(PYTEST) tests/fuzz -n $(JOBS) --timeout 3600 $(ARGS)
-	for round in $$(seq $(FUZZ_ROUNDS)); do $(PYTEST) -q -x -n $(JOBS) tests/property --hypothesis-seed $$RANDOM $(ARGS) || exit 1; done
+	for round in $$(seq $(FUZZ_ROUNDS)); do $(PYTEST) -q -x -n $(JOBS) tests/property --hypothesis-profile new --hypothesis-seed $$RANDOM $(ARGS) || exit 1; done
 
 soak: venv  ## Everything with real wires again and again, SOAK times, stopping at the first failure
 	for round in $$(seq $(SOAK)); do echo "round $$round"; $(PYTEST) -q -x tests/loop tests/crash $(ARGS) || exit 1; done
