@@ -307,6 +307,29 @@ def one_line(p: Any, q: Any, rules: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
+def settle_corners(x: Any, y: Any, run_first: Any, run_last: Any, begin: int, end: int) -> None:
+    """Give the point that two runs of a cluster share to the one that it fits better, judged without it."""
+    for k in range(begin, end - 1):
+        corner = run_last[k]
+        if corner - run_first[k] < 3 or run_last[k + 1] - corner < 3:
+            continue
+        before = off_line(x, y, run_first[k], corner - 1, corner)
+        after = off_line(x, y, corner + 1, run_last[k + 1], corner)
+        if before <= after:
+            run_first[k + 1] = corner + 1
+        else:
+            run_last[k] = corner - 1
+
+
+@njit(cache=True, nogil=True)
+def off_line(x: Any, y: Any, first: int, last: int, point: int) -> Any:
+    """Distance of a point from the regression line of points first to last."""
+    _, cx, cy, a, b, c = moments(x, y, first, last + 1)
+    gamma = 0.5 * math.atan2(2.0 * b, a - c)
+    return abs((y[point] - cy) * math.cos(gamma) - (x[point] - cx) * math.sin(gamma))
+
+
+@njit(cache=True, nogil=True)
 def trim(x: Any, y: Any, first: int, last: int, rules: Any) -> Any:
     """Leave points at the ends out that are not on the line: (first, last), at most a quarter from each end."""
     n, cx, cy, a, b, c = moments(x, y, first, last + 1)
@@ -377,6 +400,7 @@ def lines_of_points(x: Any, y: Any, beam: Any, n: int, full_turn: bool, spacing:
         begin = runs
         runs = split(px, py, first, filled - 1, rules, run_first, run_last, runs, stack)
         runs = merge_runs(px, py, run_first, run_last, begin, runs, rules, sums)
+        settle_corners(px, py, run_first, run_last, begin, runs)
     count = 0
     for j in range(runs):
         if count < rows.shape[0] and fit(px, py, run_first[j], run_last[j], rules, rows[count]):
