@@ -20,27 +20,43 @@ from drivers.readings import ChainReading, RangeReading, RangeStatus, Reading, S
 from mapping.frames import Pose2
 from mapping.odometry import DriveGeometry
 from service.config import (
+    SHARED_DRIVERS,
+    ArduinoSonars,
+    ArduinoWheels,
     CanBus,
     Cia406Wheels,
     Config,
     Device,
     Drive,
     HokuyoLaser,
+    LdrobotLaser,
+    MavlinkSonars,
+    MavlinkWheels,
+    MaxBotixSonars,
     Mount,
+    ODriveWheels,
     PlanePose,
+    RoboClawWheels,
+    RplidarLaser,
+    SickColaLaser,
+    SickLms2xxLaser,
     UsBoardSerialSonars,
     UsBoardSonars,
+    VescWheels,
+    tcp_address,
 )
 from service.fusion import SECTOR_MEMORY_NS, Fusion, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer
 from service.sensors import Chain, Laser, Sensor, Transducer, Wheels
 
 if TYPE_CHECKING:
+    from drivers.encoder_arduino_bridge import ArduinoBridgeConversation
+    from drivers.mavlink_in import MavlinkConversation
     from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
 
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """One wire and who is on it. port: the serial port behind it, None for a bus of the system."""
+    """One wire and who is on it. port: the serial port behind it, None for a bus of the system or a network address."""
 
     name: str
     port: str | None
@@ -76,13 +92,90 @@ def pose_of(place: Mount | PlanePose) -> Pose2:
 
 
 def _serial_wires(config: Config) -> Iterator[Wire]:
+    members: dict[str, dict[str, Device]] = {}
     for section, name, device in config.devices():
         port = device.serial_port()
-        if port is None:
-            continue
-        source = config.source_name(section, name)
+        if port is not None:
+            members.setdefault(port, {})[config.source_name(section, name)] = device
+    for port, devices in members.items():
+        source, device = next(iter(devices.items()))
         baud = getattr(device, "baud_bps", None) or _FIRST_BAUD.get(type(device), 115200)
-        yield Wire(source, port, partial(_open_serial, port, baud), {source: partial(conversation_of, device)})
+        address = tcp_address(port)
+        if address is not None:
+            yield Wire(source, None, partial(_open_tcp, *address), _talks(devices))
+        elif port.startswith(_UDP):
+            yield Wire(source, None, partial(_open_udp, port), _talks(devices))
+        else:
+            dtr_stops_motor = isinstance(device, RplidarLaser)
+            yield Wire(source, port, partial(_open_serial, port, baud, dtr_stops_motor), _talks(devices))
+
+
+def _talks(devices: Mapping[str, Device]) -> Mapping[str, Callable[[], Conversation[Any]]]:
+    """Makers of the conversations on one serial port; of a board that is several sources they share the board."""
+    if not any(getattr(device, "driver", None) in SHARED_DRIVERS for device in devices.values()):
+        return {source: partial(conversation_of, device) for source, device in devices.items()}
+    made: dict[str, Conversation[Any]] = {}
+
+    def make(source: str) -> Conversation[Any]:
+        if source not in made:
+            made.update(_shares_of(devices))
+        return made.pop(source)
+
+    return {source: partial(make, source) for source in devices}
+
+
+def _shares_of(devices: Mapping[str, Device]) -> dict[str, Conversation[Any]]:
+    """One new board or autopilot as the sources that it is."""
+    from drivers.shares import share_out
+
+    kinds: dict[str, type[Reading]] = {
+        source: WheelReading if isinstance(device, ArduinoWheels | MavlinkWheels) else ChainReading
+        for source, device in devices.items()
+    }
+    if any(isinstance(device, MavlinkWheels | MavlinkSonars) for device in devices.values()):
+        return share_out(_mavlink(list(devices.values())), kinds)
+    return share_out(_arduino_board(list(devices.values())), kinds)
+
+
+def _arduino_board(devices: Sequence[Device]) -> ArduinoBridgeConversation:
+    from drivers.encoder_arduino_bridge import ArduinoBridgeConversation
+
+    settings: dict[str, Any] = {"wheels": False}
+    for device in devices:
+        if isinstance(device, ArduinoWheels):
+            settings |= {
+                "wheels": True,
+                "wheel_rate_hz": device.rate_hz,
+                "max_ticks_per_s": device.max_ticks_per_s,
+                "baud_bps": device.baud_bps,
+            }
+        elif isinstance(device, ArduinoSonars):
+            settings |= {
+                "pings": [each.channel for each in device.transducers],
+                "ping_rate_hz": device.rate_hz,
+                "ping_range_max_m": device.range_max_m,
+                "zero_is_free": device.zero_is_free,
+                "baud_bps": device.baud_bps,
+            }
+    return ArduinoBridgeConversation(**settings)
+
+
+def _mavlink(devices: Sequence[Device]) -> MavlinkConversation:
+    from drivers.mavlink_in import MavlinkConversation
+
+    kinds: list[type[Reading]] = []
+    settings: dict[str, Any] = {}
+    for device in devices:
+        if not isinstance(device, MavlinkSonars | MavlinkWheels):
+            continue
+        on_udp = device.port.startswith(_UDP)
+        settings["baud_bps"] = 0 if on_udp else device.baud_bps
+        settings["system"] = settings.get("system") or device.system
+        settings["rate_hz"] = max(settings.get("rate_hz", 0.0), device.rate_hz)
+        kinds.append(WheelReading if isinstance(device, MavlinkWheels) else ChainReading)
+        if isinstance(device, MavlinkWheels):
+            settings["wheels"] = (device.wheel_left, device.wheel_right)
+    return MavlinkConversation(kinds, **settings)
 
 
 def _can_wires(config: Config) -> Iterator[Wire]:
@@ -97,13 +190,28 @@ def _can_wires(config: Config) -> Iterator[Wire]:
         yield Wire(f"can-{bus}", port, partial(_open_can, can), conversations)
 
 
+_UDP = ("udpin:", "udpout:")
 _FIRST_BAUD: dict[type[Device], int] = {UsBoardSerialSonars: 19200}
 
 
-def _open_serial(port: str, baud: int, clock: Clock) -> Port[bytes]:
+def _open_serial(port: str, baud: int, dtr_stops_motor: bool, clock: Clock) -> Port[bytes]:
     from drivers.ports import SerialPort
 
+    if dtr_stops_motor:
+        return SerialPort(port, baud=baud, clock=clock, dtr=False, dtr_at_close=True)
     return SerialPort(port, baud=baud, clock=clock)
+
+
+def _open_udp(address: str, clock: Clock) -> Port[bytes]:
+    from drivers.udp_port import UdpPort
+
+    return UdpPort(address, clock=clock)
+
+
+def _open_tcp(host: str, port: int, clock: Clock) -> Port[bytes]:
+    from drivers.ports import TcpPort
+
+    return TcpPort(host, port, clock=clock)
 
 
 def _open_can(bus: CanBus, clock: Clock) -> Port[Any]:
@@ -128,6 +236,45 @@ def conversation_of(device: Device) -> Conversation[Any]:
                 range_min_m=device.range_min_m,
                 range_max_m=device.range_max_m,
             )
+        case SickLms2xxLaser():
+            from drivers.laser_sick_lms2xx import SickLms2xxConversation
+
+            return SickLms2xxConversation(
+                field_deg=device.field_deg,
+                resolution_deg=device.resolution_deg,
+                baud=device.baud_bps,
+                unit=device.unit,
+            )
+        case RplidarLaser():
+            from drivers.laser_rplidar import RplidarConversation
+
+            return RplidarConversation(
+                baud=device.baud_bps,
+                scan_mode=device.scan,
+                pwm=device.motor_pwm,
+                range_min_m=device.range_min_m,
+                range_max_m=device.range_max_m,
+                no_echo=device.no_echo,
+            )
+        case LdrobotLaser():
+            from drivers.laser_ldrobot import LdrobotConversation
+
+            return LdrobotConversation(
+                baud=device.baud_bps,
+                range_min_m=device.range_min_m,
+                range_max_m=device.range_max_m,
+                no_echo=device.no_echo,
+            )
+        case SickColaLaser():
+            from drivers.laser_sick_cola import SickColaConversation
+
+            return SickColaConversation(
+                ahead_deg=device.ahead_deg,
+                range_min_m=device.range_min_m,
+                range_max_m=device.range_max_m,
+                no_echo=device.no_echo,
+                start=device.start,
+            )
         case UsBoardSonars():
             from drivers.sonar_usboard import UsBoardConversation
 
@@ -149,11 +296,46 @@ def conversation_of(device: Device) -> Conversation[Any]:
                 sampling=device.sampling,
                 max_turns_per_s=device.max_turns_per_s,
             )
+        case RoboClawWheels():
+            from drivers.encoder_roboclaw import RoboClawConversation
+
+            return RoboClawConversation(
+                device.address,
+                left_motor=device.left_motor,
+                rate_hz=device.rate_hz,
+                max_ticks_per_s=device.max_ticks_per_s,
+                baud_bps=device.baud_bps,
+            )
+        case ODriveWheels():
+            from drivers.encoder_odrive import ODrivePairConversation
+
+            return ODrivePairConversation(
+                device.node_left,
+                device.node_right,
+                rate_hz=device.rate_hz,
+                counts_per_turn=device.counts_per_turn,
+                max_turns_per_s=device.max_turns_per_s,
+                firmware=device.firmware,
+            )
+        case VescWheels():
+            from drivers.encoder_vesc import VescPairConversation
+
+            return VescPairConversation(
+                device.id_left, device.id_right, rate_hz=device.rate_hz, max_ticks_per_s=device.max_ticks_per_s
+            )
+        case MaxBotixSonars():
+            from drivers.sonar_maxbotix import MaxBotixConversation
+
+            return MaxBotixConversation(
+                device.family, form=device.lines, channels=_channels(device), period_s=1.0 / device.rate_hz
+            )
+        case ArduinoWheels() | ArduinoSonars() | MavlinkWheels() | MavlinkSonars():
+            return _shares_of({"": device})[""]
         case _:
             raise TypeError(f"no driver for {type(device).__name__}")
 
 
-def _channels(board: UsBoardSonars | UsBoardSerialSonars) -> list[int] | None:
+def _channels(board: UsBoardSonars | UsBoardSerialSonars | MaxBotixSonars) -> list[int] | None:
     return sorted(each.channel for each in board.transducers) or None
 
 
@@ -162,9 +344,9 @@ def _channels(board: UsBoardSonars | UsBoardSerialSonars) -> list[int] | None:
 
 def _sensor_of(source: str, device: Device) -> Sensor:
     match device:
-        case HokuyoLaser():
+        case HokuyoLaser() | SickLms2xxLaser() | RplidarLaser() | LdrobotLaser() | SickColaLaser():
             return Laser(source, pose_of(device.mount), height_m=device.mount.z_m, upside_down=device.mount.upside_down)
-        case UsBoardSonars() | UsBoardSerialSonars():
+        case UsBoardSonars() | UsBoardSerialSonars() | MaxBotixSonars() | ArduinoSonars() | MavlinkSonars():
             transducers = tuple(
                 Transducer(each.channel, Pose2(each.x_m, each.y_m, math.radians(each.yaw_deg)), each.z_m)
                 for each in device.transducers
@@ -177,7 +359,7 @@ def _sensor_of(source: str, device: Device) -> Sensor:
                 device.range_max_m,
                 round(1e9 / device.rate_hz),
             )
-        case Cia406Wheels():
+        case Cia406Wheels() | ArduinoWheels() | RoboClawWheels() | ODriveWheels() | VescWheels() | MavlinkWheels():
             return Wheels(source)
         case _:
             raise TypeError(f"no sensor for {type(device).__name__}")

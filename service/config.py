@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from service.config_faults import Fault, faults_of, without_faults
 from service.config_files import DEFAULT_ENDPOINT, KeyPath, Layers, find_config, origin_of, read_layers
@@ -26,6 +27,8 @@ Positive = Annotated[float, Field(gt=0)]
 Point = tuple[float, float]
 SENSOR_SECTIONS = ("lasers", "sonars")
 DEVICE_SECTIONS = (*SENSOR_SECTIONS, "wheels")
+SHARED_DRIVERS = ("arduino-bridge", "mavlink")
+"""Of boards that are several sources: a table in each section may name the same port."""
 
 
 class Section(BaseModel):
@@ -139,7 +142,7 @@ class Device(Section):
     """What every device has: which wire it is on and what it claims there."""
 
     def serial_port(self) -> str | None:
-        """The serial port the device has for itself."""
+        """The serial port the device has for itself, or its address as tcp://HOST:PORT."""
         return getattr(self, "port", None)
 
     def can_bus(self) -> str | None:
@@ -151,11 +154,38 @@ class Device(Section):
         return frozenset()
 
 
+NoEcho = Literal["unknown", "clear"]
+_ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^/:\s]+):(\d{1,5})")
+
+
+def tcp_address(port: str) -> tuple[str, int] | None:
+    """Host and TCP port of an address tcp://HOST:PORT; None for a serial port. ValueError if it is neither."""
+    if not port.startswith("tcp:"):
+        return None
+    match = _ADDRESS.fullmatch(port)
+    if match is None or not 0 < int(match[2]) < 65536:
+        raise ValueError("an address is written tcp://HOST:PORT, such as tcp://192.168.0.10:10940")
+    return match[1].strip("[]"), int(match[2])
+
+
+def _good_port(port: str) -> str:
+    tcp_address(port)
+    return port
+
+
+PortName = Annotated[str, Field(min_length=1), AfterValidator(_good_port)]
+_PORT = "Serial port, best by a stable name (/dev/serial/by-id/...), or an address: tcp://192.168.0.10:10940."
+_NO_ECHO = (
+    "What a distance of 0 means. unknown: too far, or too near, too dark, glass; clear: nothing up to the farthest "
+    "echo, which frees space and is right only where none of these is around."
+)
+
+
 class HokuyoLaser(Device):
-    """Hokuyo laser rangefinder, SCIP 2.x (URG-04LX, UTM-30LX and kin), on USB or RS-232."""
+    """Hokuyo laser rangefinder, SCIP 2.x (URG-04LX, UTM-30LX and kin), on USB, RS-232 or TCP (port 10940)."""
 
     driver: Literal["hokuyo"] = Field(description="Says that it is this kind of device.")
-    port: str = Field(min_length=1, description="Serial port, best by a stable name: /dev/serial/by-id/...")
+    port: PortName = Field(description=_PORT)
     baud_bps: int | None = Field(
         default=None, ge=1200, le=4000000, description="Line speed to try first on RS-232; default: all of them."
     )
@@ -179,8 +209,77 @@ class HokuyoLaser(Device):
         return self
 
 
-LaserDevice = HokuyoLaser
-"""Any laser: with a second kind, Annotated[First | Second, Field(discriminator="driver")]."""
+class SickLms2xxLaser(Device):
+    """SICK LMS200, 211, 220, 221 or 291, on RS-232 or RS-422."""
+
+    driver: Literal["sick_lms2xx"] = Field(description="Says that it is this kind of device.")
+    port: PortName = Field(description=_PORT)
+    baud_bps: Literal[9600, 19200, 38400, 500000] = Field(
+        default=38400, description="Line speed to work at; 500000 needs RS-422. It is found at any other and set."
+    )
+    field_deg: Literal[180, 100] = Field(default=180, description="Field of view.")
+    resolution_deg: float = Field(
+        default=0.5, description="Angle between beams: 1.0 or 0.5; with a field of 100 also 0.25."
+    )
+    unit: Literal["keep", "mm", "cm"] = Field(
+        default="keep", description="mm: up to 8 m; cm: up to 80 m; written into the scanner where it is set otherwise."
+    )
+    mount: Mount = Field(default=Mount(), description="Where the laser sits.")
+
+    @model_validator(mode="after")
+    def _variant(self) -> SickLms2xxLaser:
+        choices = (1.0, 0.5, 0.25) if self.field_deg == 100 else (1.0, 0.5)
+        if self.resolution_deg not in choices:
+            raise ValueError(f"with a field of {self.field_deg} deg resolution_deg is one of {choices}")
+        return self
+
+
+class RplidarLaser(Device):
+    """Slamtec RPLIDAR A1, A2 or A3, on its USB adapter."""
+
+    driver: Literal["rplidar"] = Field(description="Says that it is this kind of device.")
+    port: PortName = Field(description=_PORT)
+    baud_bps: int | None = Field(
+        default=None, ge=1200, le=4000000, description="Line speed; default: 115200 and 256000 are tried in turn."
+    )
+    scan: Literal["auto", "standard", "express"] = Field(
+        default="auto", description="Scan mode; auto: express where the device has it."
+    )
+    motor_pwm: int = Field(default=660, ge=1, le=1023, description="Motor speed of A2 and later.")
+    no_echo: NoEcho = Field(default="unknown", description=_NO_ECHO)
+    range_min_m: float = Field(default=0.15, ge=0, description="Nearest echo.")
+    range_max_m: Positive | None = Field(default=None, description="Farthest echo; default: by model or mode.")
+    mount: Mount = Field(default=Mount(), description="Where the laser sits; it looks away from its cable.")
+
+
+class LdrobotLaser(Device):
+    """LDROBOT LD06 or LD19, on a serial line; it sends as soon as it has power."""
+
+    driver: Literal["ldrobot"] = Field(description="Says that it is this kind of device.")
+    port: PortName = Field(description=_PORT)
+    baud_bps: int = Field(default=230400, ge=1200, le=4000000, description="Line speed.")
+    no_echo: NoEcho = Field(default="unknown", description=_NO_ECHO)
+    range_min_m: float = Field(default=0.02, ge=0, description="Nearest echo.")
+    range_max_m: Positive = Field(default=12.0, description="Farthest echo.")
+    mount: Mount = Field(default=Mount(), description="Where the laser sits; it looks where its mark points.")
+
+
+class SickColaLaser(Device):
+    """SICK TiM5xx, TiM7xx, LMS1xx and relatives that speak CoLa binary, over TCP."""
+
+    driver: Literal["sick_cola"] = Field(description="Says that it is this kind of device.")
+    port: PortName = Field(description="Its address, such as tcp://192.168.0.1:2112.")
+    start: bool = Field(default=True, description="Log in and start the measurement where it does not run.")
+    ahead_deg: float = Field(default=90.0, ge=-360, le=360, description="The scanner's angle that looks ahead.")
+    no_echo: NoEcho = Field(default="unknown", description=_NO_ECHO)
+    range_min_m: float = Field(default=0.05, ge=0, description="Nearest echo.")
+    range_max_m: Positive | None = Field(default=None, description="Farthest echo; default: by model.")
+    mount: Mount = Field(default=Mount(), description="Where the laser sits.")
+
+
+LaserDevice = Annotated[
+    HokuyoLaser | SickLms2xxLaser | RplidarLaser | LdrobotLaser | SickColaLaser, Field(discriminator="driver")
+]
 
 
 class Transducer(Section):
@@ -238,7 +337,92 @@ class UsBoardSerialSonars(_UsBoard):
     port: str = Field(min_length=1, description="Serial port, best by a stable name: /dev/serial/by-id/...")
 
 
-SonarDevice = Annotated[UsBoardSonars | UsBoardSerialSonars, Field(discriminator="driver")]
+class _PlainSonars(Device):
+    """Sonars without a board of their own."""
+
+    cone_deg: float = Field(default=30.0, gt=0, le=120, description="Full opening angle of a transducer.")
+    range_min_m: float = Field(default=0.02, ge=0, description="Nearest distance a transducer measures.")
+    range_max_m: Positive = Field(default=3.0, description="Farther echoes count as nothing seen.")
+    transducers: tuple[Transducer, ...] = Field(default=(), max_length=64, description="The connected ones.")
+
+    @model_validator(mode="after")
+    def _sensible(self) -> _PlainSonars:
+        channels = [transducer.channel for transducer in self.transducers]
+        if len(set(channels)) != len(channels):
+            raise ValueError("two transducers have the same channel; each has a channel of its own")
+        if self.range_min_m >= self.range_max_m:
+            raise ValueError("range_min_m must be below range_max_m")
+        return self
+
+
+class MaxBotixSonars(_PlainSonars):
+    """MaxBotix sensors by their serial text: one on a UART, or several behind a micro-controller that prints lines."""
+
+    driver: Literal["maxbotix"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description="Serial port, best by a stable name: /dev/serial/by-id/...")
+    baud_bps: int = Field(default=9600, ge=1200, le=4000000, description="Line speed; a sensor's own is 9600.")
+    family: Literal["lv", "xl", "hr-5m", "hr-10m"] = Field(
+        description="What the digits mean: lv inches, xl centimetres, hr millimetres (5 m or 10 m type)."
+    )
+    lines: Literal["single", "labelled", "list"] = Field(
+        default="single",
+        description="single: one sensor, channel 1; labelled: `3:R1234`; list: `R123 R087` in order of channels.",
+    )
+    rate_hz: float = Field(default=10.0, gt=0, le=50, description="How often each channel comes.")
+
+    @model_validator(mode="after")
+    def _one_on_a_line(self) -> MaxBotixSonars:
+        if self.lines == "single" and [each.channel for each in self.transducers] not in ([], [1]):
+            raise ValueError('a sensor on a UART of its own is channel 1; for several set lines = "labelled" or "list"')
+        return self
+
+
+_BRIDGE_PORT = "Serial port of the board; its wheels and sonars name the same."
+_MAVLINK_PORT = "Serial port, udpin:127.0.0.1:14550 (listens) or udpout:127.0.0.1:14550; its sources name the same."
+
+
+class ArduinoSonars(_PlainSonars):
+    """Ping sonars of a board with the text protocol of ros_arduino_bridge."""
+
+    driver: Literal["arduino-bridge"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description=_BRIDGE_PORT)
+    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed as set in the sketch.")
+    rate_hz: float = Field(default=5.0, gt=0, le=20, description="How often each sonar is asked.")
+    zero_is_free: bool = Field(
+        default=False, description="0 cm means that nothing is in reach; else that nothing is known."
+    )
+    transducers: tuple[Transducer, ...] = Field(
+        min_length=1, max_length=64, description="The connected ones; the channel is the pin."
+    )
+
+
+class MavlinkSonars(_PlainSonars):
+    """Distances from an autopilot: DISTANCE_SENSOR."""
+
+    driver: Literal["mavlink"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description=_MAVLINK_PORT)
+    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed of a serial port.")
+    system: int | None = Field(default=None, ge=1, le=255, description="System id; default: the first that is heard.")
+    rate_hz: float = Field(default=10.0, gt=0, le=200, description="Asked of the autopilot.")
+
+    @field_validator("port")
+    @classmethod
+    def _reachable(cls, port: str) -> str:
+        return _mavlink_port(port)
+
+
+def _mavlink_port(port: str) -> str:
+    if port.startswith(("udpin:", "udpout:")):
+        from drivers.udp_port import parse_udp
+
+        if parse_udp(port) is None:
+            raise ValueError(f"{port} is no UDP address; write udpin:127.0.0.1:14550")
+    return port
+
+
+SonarDevice = Annotated[
+    UsBoardSonars | UsBoardSerialSonars | MaxBotixSonars | ArduinoSonars | MavlinkSonars, Field(discriminator="driver")
+]
 
 
 class Cia406Wheels(Device):
@@ -269,7 +453,101 @@ class Cia406Wheels(Device):
         return self
 
 
-WheelDevice = Annotated[Cia406Wheels, Field(description="The encoders of both wheels.")]
+class ArduinoWheels(Device):
+    """Wheel counts of a board with the text protocol of ros_arduino_bridge."""
+
+    driver: Literal["arduino-bridge"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description=_BRIDGE_PORT)
+    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed as set in the sketch.")
+    rate_hz: float = Field(default=30.0, gt=0, le=100, description="Samples a second.")
+    max_ticks_per_s: Positive = Field(
+        default=50000.0, description="No wheel counts faster; tells damage and resets from motion."
+    )
+
+
+class RoboClawWheels(Device):
+    """A RoboClaw motor controller in packet serial mode, with an encoder at each motor."""
+
+    driver: Literal["roboclaw"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description="Serial port, best by a stable name: /dev/serial/by-id/...")
+    baud_bps: int = Field(default=38400, ge=1200, le=4000000, description="Line speed; any on USB.")
+    address: int = Field(default=0x80, ge=0x80, le=0x87, description="As set in the controller, 0x80 to 0x87.")
+    left_motor: Literal[1, 2] = Field(default=1, description="The motor at the left wheel.")
+    rate_hz: float = Field(default=50.0, gt=0, le=200, description="Samples a second.")
+    max_ticks_per_s: Positive = Field(
+        default=200000.0, description="No wheel counts faster; tells damage and resets from motion."
+    )
+
+
+class ODriveWheels(Device):
+    """Two ODrive axes on CAN (CANSimple), firmware 0.5.x or 0.6.x."""
+
+    driver: Literal["odrive"] = Field(description="Says that it is this kind of device.")
+    can: Name = Field(description="The [can.NAME] they are on.")
+    node_left: int = Field(default=0, ge=0, le=63, description="Node id of the left wheel's axis.")
+    node_right: int = Field(default=1, ge=0, le=63, description="Node id of the right wheel's axis.")
+    rate_hz: float = Field(default=100.0, gt=0, le=500, description="Samples a second.")
+    counts_per_turn: int = Field(default=8192, ge=1, description="Of the encoders (cpr); positions are told in counts.")
+    max_turns_per_s: Positive = Field(default=100.0, description="No motor turns faster; tells resets from motion.")
+    firmware: Literal["auto", "0.5", "0.6"] = Field(default="auto", description="Generation; 0.6 has no counts.")
+
+    def can_ids(self) -> frozenset[int]:
+        """All commands of both nodes."""
+        return frozenset(node << 5 | command for node in (self.node_left, self.node_right) for command in range(32))
+
+    @model_validator(mode="after")
+    def _two_nodes(self) -> ODriveWheels:
+        if self.node_left == self.node_right:
+            raise ValueError("node_left and node_right are the same; each axis has a node id of its own")
+        return self
+
+
+class VescWheels(Device):
+    """Two VESC motor controllers on CAN that send status 5 (tachometer) by themselves."""
+
+    driver: Literal["vesc"] = Field(description="Says that it is this kind of device.")
+    can: Name = Field(description="The [can.NAME] they are on.")
+    id_left: int = Field(ge=0, le=254, description="Controller id of the left wheel.")
+    id_right: int = Field(ge=0, le=254, description="Controller id of the right wheel.")
+    rate_hz: float = Field(default=50.0, gt=0, le=1000, description="As set in VESC Tool for status 5.")
+    max_ticks_per_s: Positive = Field(
+        default=30000.0, description="No tachometer counts faster; tells resets from motion."
+    )
+
+    @model_validator(mode="after")
+    def _two_controllers(self) -> VescWheels:
+        if self.id_left == self.id_right:
+            raise ValueError("id_left and id_right are the same; each controller has an id of its own")
+        return self
+
+
+class MavlinkWheels(Device):
+    """The ways of an autopilot's wheels: WHEEL_DISTANCE. A tick is a micrometre."""
+
+    driver: Literal["mavlink"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description=_MAVLINK_PORT)
+    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed of a serial port.")
+    system: int | None = Field(default=None, ge=1, le=255, description="System id; default: the first that is heard.")
+    rate_hz: float = Field(default=20.0, gt=0, le=200, description="Asked of the autopilot.")
+    wheel_left: int = Field(default=0, ge=0, le=15, description="Index of the left wheel.")
+    wheel_right: int = Field(default=1, ge=0, le=15, description="Index of the right wheel.")
+
+    @field_validator("port")
+    @classmethod
+    def _reachable(cls, port: str) -> str:
+        return _mavlink_port(port)
+
+    @model_validator(mode="after")
+    def _two_wheels(self) -> MavlinkWheels:
+        if self.wheel_left == self.wheel_right:
+            raise ValueError("wheel_left and wheel_right are the same wheel")
+        return self
+
+
+WheelDevice = Annotated[
+    Cia406Wheels | ArduinoWheels | RoboClawWheels | ODriveWheels | VescWheels | MavlinkWheels,
+    Field(discriminator="driver", description="The encoders of both wheels."),
+]
 
 
 # --- maps -----------------------------------------------------------------------------------------------------------
@@ -695,20 +973,22 @@ def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
 
 
 def _port_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
-    taken: dict[str, str] = {}
+    taken: dict[str, tuple[str, str, Any]] = {}
     claims = [
-        ((section, name, key), table.get(key))
+        ((section, name, key), table.get(key), table.get("driver"))
         for section, key in (*((each, "port") for each in DEVICE_SECTIONS), ("can", "channel"))
         for name, table in _tables(data, section)
     ]
-    for path, port in claims:
+    for path, port, driver in claims:
         if not isinstance(port, str):
             continue
         real = os.path.realpath(port) if port.startswith("/") else port
-        if real in taken:
-            yield Fault(path, f"{port} is already used by {taken[real]}; each wire has a port of its own")
-        else:
-            taken[real] = ".".join(path[:-1])
+        section, owner, owners_driver = taken.setdefault(real, (path[0], ".".join(path[:-1]), driver))
+        if owner == ".".join(path[:-1]) or (
+            driver in SHARED_DRIVERS and driver == owners_driver and path[0] != section
+        ):
+            continue
+        yield Fault(path, f"{port} is already used by {owner}; each wire has a port of its own")
 
 
 def _can_id_faults(config: Config) -> Iterator[Fault]:

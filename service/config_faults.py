@@ -27,6 +27,8 @@ EXPECTED = {
     "finite_number": "expected a finite number",
 }
 
+_TAG_FAULTS = ("union_tag_not_found", "union_tag_invalid")
+
 
 @dataclass(frozen=True, slots=True)
 class Fault:
@@ -41,6 +43,10 @@ def faults_of(error: ValidationError, model: type[BaseModel], data: Mapping[str,
     faults = []
     for detail in error.errors():
         path = _key_path(detail["loc"], data)
+        if detail["type"] in _TAG_FAULTS:
+            path = (*path, "driver")
+        if detail["type"] in ("union_tag_not_found", "union_tag_invalid"):
+            path = (*path, "driver")
         faults.append(Fault(path, _sentence(detail, path, model, data)))
     return faults
 
@@ -74,7 +80,7 @@ def _key_path(location: tuple[int | str, ...], data: Mapping[str, Any]) -> KeyPa
             path.append(step)
             node = node[step]
         elif step != "[key]" and position == len(location) - 1 and isinstance(node, Mapping):
-            path.append(step)
+            path += [step] if step != node.get("driver") else []  # that is pydantic's tag of the kind, not a key
     return tuple(path)
 
 
@@ -86,9 +92,12 @@ def _sentence(detail: Any, path: KeyPath, model: type[BaseModel], data: Mapping[
         return "is missing; add it"
     if kind == "value_error":
         return str(context["error"])
-    if kind in ("union_tag_not_found", "union_tag_invalid"):
-        given = f"unknown driver {context['tag']!r}" if "tag" in context else "driver is missing"
-        return f"{given}; known: {context.get('expected_tags', '')}" if "tag" in context else f"{given}; add it"
+    if kind in _TAG_FAULTS:
+        return (
+            f"is {context['tag']!r}, must be one of {context['expected_tags']}"
+            if "tag" in context
+            else "is missing; add it"
+        )
     if kind == "literal_error":
         return f"is {detail['input']!r}, must be {context['expected']}"
     if kind == "string_pattern_mismatch":
