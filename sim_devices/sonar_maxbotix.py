@@ -12,13 +12,13 @@ nearer than the least distance reads as the least distance; the host's bytes are
 stops ranging, which no serial port does). The sensor measures at the begin of its cycle and tells at the end.
 
 The multiplexer is a micro-controller that fires its sensors in turn, so that they do not hear each other, and prints
-one line a reading: by default the channel, a blank, the sensor's own text, CR LF. Sensors on it that are not connected
-are left out.
+lines that end with CR LF: one for each reading with the channel before it ("3:R1234"), or one for each round with all
+readings in order of their channels ("R0480 R1234"). Sensors on it that are not connected are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, radians
 
@@ -63,6 +63,7 @@ FAMILIES: dict[str, Family] = {
     "lv": Family(0.0254, 3, 6, 254, 255, 49_000_000, ("LV-MaxSonar-EZ", "RoHS")),
     "xl": Family(0.01, 3, 20, 765, 765, 99_000_000, ("XL-MaxSonar-EZ", "RoHS")),
     "hr": Family(0.001, 4, 300, 4999, 5000, 133_000_000, _HRXL_BANNER),
+    "hr-5m": Family(0.001, 4, 300, 4999, 5000, 133_000_000, _HRXL_BANNER),
     "hr-10m": Family(0.001, 4, 500, 9998, 9999, 166_000_000, _HRXL_BANNER),
     "hrusb": Family(0.001, 4, 300, 4999, 5000, 133_000_000, ("HRUSB-MaxSonar", "RoHS"), tail=" "),
 }
@@ -212,18 +213,10 @@ class MaxBotix(_Talker):
         self._line_ns += self.family.period_ns
 
 
-LineFormat = Callable[[int, bytes], bytes]
-
-
-def plain_line(channel: int, text: bytes) -> bytes:
-    """The multiplexer's line: channel, blank, the sensor's text."""
-    return b"%d %s\r\n" % (channel, text)
-
-
 class TextMultiplexer(_Talker):
     """Sensors fired in turn by a micro-controller that prints a line for each.
 
-    mounts: channel -> where that sensor sits.  line: how a line is written.  baud_bps: of its own line.
+    mounts: channel -> where that sensor sits.  lines: "labelled" or "list".  baud_bps: of its own line.
     """
 
     def __init__(
@@ -235,14 +228,17 @@ class TextMultiplexer(_Talker):
         half_angle_rad: float = radians(15.0),
         noise_m: float = 0.002,
         baud_bps: int = BAUD,
-        line: LineFormat = plain_line,
+        lines: str = "labelled",
         seed: int = 0,
     ) -> None:
         if not mounts:
             raise ValueError("a multiplexer needs at least one sensor")
         super().__init__((), baud_bps)
         self._cycle_ns = FAMILIES[family].period_ns
-        self._line = line
+        if lines not in ("labelled", "list"):
+            raise ValueError("a multiplexer prints labelled lines or lists")
+        self._is_list = lines == "list"
+        self._round: list[bytes] = []
         self._ears = {
             channel: _Ear(scene, mount, half_angle_rad, FAMILIES[family], noise_m, seed + channel)
             for channel, mount in sorted(mounts.items())
@@ -252,6 +248,7 @@ class TextMultiplexer(_Talker):
     def power_on(self, now_ns: int) -> None:
         """The supply comes: the first sensor is first."""
         self._turn = 0
+        self._round = []
         super().power_on(now_ns)
 
     def _first_ns(self) -> int:
@@ -260,6 +257,15 @@ class TextMultiplexer(_Talker):
     def _say_next(self, now_ns: int) -> None:
         channel = list(self._ears)[self._turn % len(self._ears)]
         if self._ears[channel].is_connected:
-            self._wire.send(self._line(channel, self._ears[channel].text(now_ns - self._cycle_ns)), now_ns)
+            text = self._ears[channel].text(now_ns - self._cycle_ns)
+            self._round.append(text if self._is_list else b"%d:%s" % (channel, text))
         self._turn += 1
         self._line_ns += self._cycle_ns
+        if self._round and (not self._is_list or self._turn % len(self._ears) == 0):
+            self._wire.send(b" ".join(self._round) + b"\r\n", now_ns)
+            self._round = []
+
+    @property
+    def rate_hz(self) -> float:
+        """How often each channel comes."""
+        return SECOND_NS / (self._cycle_ns * len(self._ears))

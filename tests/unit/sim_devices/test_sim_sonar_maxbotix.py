@@ -81,8 +81,14 @@ def test_the_banner_begins_no_reading() -> None:
 def test_the_multiplexer_takes_turns() -> None:
     device = TextMultiplexer(Wall(), {3: Mount(3.0), 1: Mount(1.0), 2: Mount(2.0)}, noise_m=0.0)
     assert lines(device, 0, 1400 * MS)[:7] == [
-        b"1 R1000", b"2 R2000", b"3 R3000", b"1 R1000", b"2 R2000", b"3 R3000", b"1 R1000",
+        b"1:R1000", b"2:R2000", b"3:R3000", b"1:R1000", b"2:R2000", b"3:R3000", b"1:R1000",
     ]  # fmt: skip
+
+
+def test_the_multiplexer_lists_a_round_in_order_of_channels() -> None:
+    device = TextMultiplexer(Wall(), {3: Mount(3.0), 1: Mount(1.0)}, noise_m=0.0, lines="list")
+    assert lines(device, 0, 1400 * MS)[:2] == [b"R1000 R3000", b"R1000 R3000"]
+    assert device.rate_hz == pytest.approx(1.0 / 0.266)
 
 
 def test_a_long_pause_is_not_made_up_for() -> None:
@@ -101,10 +107,10 @@ def test_faults_by_text() -> None:
     for second in range(9):
         said = b"".join(device.step(second * SECOND + at * MS, b"") for at in range(1000))
         seen.append(set(said.split(b"\r\n")[1:-1]))  # whole lines
-    assert seen[1] == seen[8] == {b"1 R1000", b"2 R2000", b"3 R3000"}
-    assert seen[3] == {b"1 R1000", b"2 R0700", b"3 R3000"}
-    assert seen[5] == {b"1 R1000", b"2 R2000"}
-    assert seen[7] == {b"1 R3000", b"2 R2000", b"3 R1000"}
+    assert seen[1] == seen[8] == {b"1:R1000", b"2:R2000", b"3:R3000"}
+    assert seen[3] == {b"1:R1000", b"2:R0700", b"3:R3000"}
+    assert seen[5] == {b"1:R1000", b"2:R2000"}
+    assert seen[7] == {b"1:R3000", b"2:R2000", b"3:R1000"}
 
 
 def test_another_rate_reads_nonsense() -> None:
