@@ -45,8 +45,6 @@ def faults_of(error: ValidationError, model: type[BaseModel], data: Mapping[str,
         path = _key_path(detail["loc"], data)
         if detail["type"] in _TAG_FAULTS:
             path = (*path, "driver")
-        if detail["type"] in ("union_tag_not_found", "union_tag_invalid"):
-            path = (*path, "driver")
         faults.append(Fault(path, _sentence(detail, path, model, data)))
     return faults
 
