@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from sim_devices.device import F64, Frame, Mount
 from sim_devices.encoder_arduino_bridge import ArduinoBridge
 from sim_devices.encoder_cia406 import Cia406Encoder
 from sim_devices.encoder_vesc import Vesc
-from sim_devices.faults import FaultPlan
+from sim_devices.faults import KINDS, FaultPlan
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.wheel import Wheel
 
@@ -335,3 +336,9 @@ def test_every_counter_can_wrap_and_reset_by_text(name: str, kind: str) -> None:
         assert isinstance(board, Cia406Encoder)
         count, end = board.position(SECOND), 1 << 32
     assert count == (end - 100 if kind == "wrap=100" else 0)
+
+
+def test_the_page_for_users_lists_every_kind_as_it_is() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "faults.md").read_text(encoding="utf-8")
+    for name, kind in KINDS.items():
+        assert f"| `{name}` | {kind.hits} | {kind.meaning} | {kind.value:g} |" in page
