@@ -22,7 +22,7 @@ from mapping.lines.lines import Lines, as_points, no_lines
 
 F64 = NDArray[np.float64]
 
-FARTHEST_M: Final = 1e5  # a "range" beyond is no measurement; squares of it still keep micrometres
+FARTHEST_M: Final = 1e4  # a "range" beyond is no measurement; squares of it still keep micrometres
 _SEAM_FACTOR: Final = 1.5  # the first beam follows the last if the gap between them is no wider than so many steps
 
 

@@ -102,6 +102,8 @@ def regression_line(points: ArrayLike, *, sigma_m: ArrayLike = 1.0, across_m: Ar
     if distance < 0.0:
         n, distance = -n, -distance
     spread = float(w @ (t * t))
+    if spread < 1e-150:
+        raise ValueError("a line needs two different points: these are too close to tell apart")
     turn = float((w * t * error) @ (w * t * error)) / spread**2
     shift = float((w * error) @ (w * error)) / total**2
     both = float((w * t * error) @ (w * error)) / (spread * total)

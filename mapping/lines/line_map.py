@@ -28,7 +28,7 @@ Cell = tuple[int, int]
 
 CELL_M: Final = 4.0
 _FARTHEST_M: Final = 1e7
-_LONGEST_M: Final = 1e4
+_LONGEST_M: Final = 1e5
 _FIRST_ROOM: Final = 64
 _HEAD: Final = struct.Struct("<4sII")
 _MAGIC: Final = b"LNS1"

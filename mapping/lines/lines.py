@@ -79,7 +79,7 @@ class Lines:
         along = normal[:, 1] * centre[:, 0] - normal[:, 0] * centre[:, 1]
         across, largest = self._eigenvalues()
         scale = np.maximum(1.0, across / np.maximum(self.rows[:, kernels.COUNT] - 2.0, 1.0))
-        angle_var = scale / np.maximum(largest, 1e-300)
+        angle_var = scale / np.maximum(largest, 1e-12)
         covariance = np.empty((len(self), 2, 2))
         covariance[:, 0, 0] = angle_var
         covariance[:, 0, 1] = covariance[:, 1, 0] = -along * angle_var

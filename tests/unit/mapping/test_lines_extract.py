@@ -52,7 +52,7 @@ def office(seed: int) -> tuple[F64, Pose2]:
         x, y = random.uniform(-3.8, 3.0), random.choice([-2.8, 2.0])
         w, h = random.uniform(0.3, 0.9, 2)
         walls += box(x, y, x + w, y + h)
-    return np.array(walls), Pose2(*random.uniform(-0.8, 0.8, 2), random.uniform(-3.0, 3.0))
+    return np.array(walls), Pose2(*map(float, random.uniform([-0.8, -0.8, -3.0], [0.8, 0.8, 3.0])))
 
 
 def wall_error(lines: Lines, walls: F64) -> tuple[F64, F64]:

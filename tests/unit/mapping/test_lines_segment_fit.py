@@ -227,7 +227,7 @@ BAD_POINTS = [[1.0, 2.0], [[1.0, 2.0, 3.0]], [[[1.0, 2.0]]], [[math.nan, 0.0], [
 
 
 @pytest.mark.parametrize("points", BAD_POINTS)
-def test_what_are_no_points_is_refused(points: list[object]) -> None:
+def test_what_are_no_points_is_refused(points: list[float]) -> None:
     for call in (
         lambda: segment_points(points, 0.1),
         lambda: split_at_end_points(points, 0.1),
