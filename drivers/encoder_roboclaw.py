@@ -280,6 +280,9 @@ class RoboClawConversation:
 
     def _find_answer(self, command: Command) -> bytes | None:
         """The data of the answer, wherever in what came since the question it begins; None if it is not whole yet."""
+        if (surplus := len(self._buffer) - 4 * _LONGEST_VERSION) > 0:
+            self._counters.drop("noise_bytes", surplus)
+            del self._buffer[:surplus]
         for start in range(len(self._buffer)):
             for answer in self._candidates(command, start):
                 try:
@@ -290,9 +293,6 @@ class RoboClawConversation:
                     self._counters.drop("noise_bytes", start)
                 self._buffer.clear()
                 return data
-        if len(self._buffer) > 4 * _LONGEST_VERSION:
-            self._counters.drop("noise_bytes", len(self._buffer) - _LONGEST_VERSION)
-            del self._buffer[:-_LONGEST_VERSION]
         return None
 
     def _candidates(self, command: Command, start: int) -> list[bytes]:

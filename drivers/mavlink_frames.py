@@ -15,6 +15,7 @@ Source: MAVLink guide, "Packet serialization"; common.xml.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -36,7 +37,8 @@ class Layout:
     base_size: int
 
 
-HEARTBEAT, ATTITUDE, COMMAND_LONG, DISTANCE_SENSOR, ODOMETRY, WHEEL_DISTANCE = 0, 30, 76, 132, 331, 9000
+HEARTBEAT, ATTITUDE, COMMAND_LONG, DISTANCE_SENSOR, OBSTACLE_DISTANCE = 0, 30, 76, 132, 330
+ODOMETRY, WHEEL_DISTANCE = 331, 9000
 LAYOUTS: dict[int, Layout] = {
     # custom_mode, type, autopilot, base_mode, system_status, version
     HEARTBEAT: Layout(struct.Struct("<IBBBBB"), 50, 9),
@@ -46,11 +48,24 @@ LAYOUTS: dict[int, Layout] = {
     COMMAND_LONG: Layout(struct.Struct("<fffffffHBBB"), 152, 33),
     # time_boot_ms, min, max, current (cm), type, id, orientation, covariance | fields of view, quaternion, quality
     DISTANCE_SENSOR: Layout(struct.Struct("<IHHHBBBBffffffB"), 85, 14),
+    # time_usec, 72 distances, min, max (cm), type, increment (deg) | increment (deg), angle of the first, frame
+    OBSTACLE_DISTANCE: Layout(struct.Struct("<Q72HHHBBffB"), 23, 158),
     # time_usec, x y z, q, v, rates, covariances of pose and speed, frame, child frame | resets, estimator, quality
     ODOMETRY: Layout(struct.Struct("<Q13f42fBBBBb"), 91, 230),
     # time_usec, 16 distances (m), count
     WHEEL_DISTANCE: Layout(struct.Struct("<Q16dB"), 113, 137),
 }
+
+
+_MARK = re.compile(rb"[\xFD\xFE]")
+_HEADER = re.compile(  # of a message that is known here: noise is passed over at the speed of this search
+    b"\xfd[\x01-\xff][\x00\x01]....(?:"
+    + b"|".join(re.escape(message_id.to_bytes(3, "little")) for message_id in LAYOUTS)
+    + b")|\xfe....(?:"
+    + b"|".join(re.escape(bytes((message_id,))) for message_id in LAYOUTS if message_id < 256)
+    + b")",
+    re.DOTALL,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +138,13 @@ class Frames:
 
     def _next_start(self, at: int) -> int:
         """Where the next frame could begin; what lies before is noise (or a frame that we do not know)."""
-        found = [start for mark in (_V1, _V2) if (start := self._buffer.find(mark, at)) >= 0]
-        start = min(found, default=len(self._buffer))
+        header = _HEADER.search(self._buffer, at)
+        if header is not None:
+            start = header.start()
+        else:  # perhaps the beginning of one, at the end
+            tail = max(at, len(self._buffer) - _V2_HEADER + 1)
+            mark = _MARK.search(self._buffer, tail)
+            start = len(self._buffer) if mark is None else mark.start()
         self._counters.drop("noise_bytes", start - at + 1)
         return start
 

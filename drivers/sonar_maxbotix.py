@@ -89,6 +89,7 @@ def decode_value(digits: str, model: Model) -> tuple[float, RangeStatus]:
     return value * model.unit_m, RangeStatus.ECHO
 
 
+_END = re.compile(rb"[\r\n]")
 _SINGLE = re.compile(r"(?:.*?)R(\d+) ?", re.DOTALL)  # noise in front is no reason to lose a whole value
 _LABELLED = re.compile(r"[A-Za-z#]{0,8}(\d{1,2})[:=,; \t]+R?(\d+) ?")
 _ITEM = re.compile(r"R?(\d+)")
@@ -224,8 +225,8 @@ class MaxBotixConversation:
 
     def _line_end(self) -> int | None:
         """Where the next line ends: CR, or LF too in lines of a micro-controller."""
-        ends = [at for end in (b"\r", b"\n") if (at := self._buffer.find(end)) >= 0]
-        return min(ends, default=None)
+        match = _END.search(self._buffer)
+        return None if match is None else match.start()
 
     def _take_line(self, line: bytes, began_ns: int, *, torn: bool) -> Iterator[Reading]:
         if not line.strip(b" \t\0"):
