@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Generic
@@ -38,6 +39,7 @@ _SETUP_LIMIT_NS = 20_000_000_000  # spin-up and the search for a line speed incl
 _EVENT_PERIOD_NS = 1_000_000_000  # between two events that tell the same state in other words
 _LOG_PERIOD_NS = 60_000_000_000
 _SHORTEST_WAIT_S = 0.0005
+_POSTED_MAX = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +101,7 @@ class WireReader(Generic[WireT]):
         self._tap = tap
         self._stopping = threading.Event()
         self._start_anew = threading.Event()
+        self._posted: deque[WireT] = deque(maxlen=_POSTED_MAX)
         self._wait = wait if wait is not None else self._stopping.wait
         self._lock = threading.RLock()  # held while a batch is worked on, never while waiting for one
         self._port: Port[WireT] | None = None
@@ -136,6 +139,10 @@ class WireReader(Generic[WireT]):
     def start_anew(self) -> None:
         """Begin every conversation from reset with the next turn, so that a recording has its set-up. Any thread."""
         self._start_anew.set()
+
+    def post(self, item: WireT) -> None:
+        """Send something that no conversation asked for, with the next turn; the oldest is lost if many wait."""
+        self._posted.append(item)
 
     def run(self) -> None:
         """The loop, until stop(). Called by the thread."""
@@ -177,6 +184,7 @@ class WireReader(Generic[WireT]):
                     self._tap(Direction.TURN, now_ns, "")
                 for source in self._sources:
                     self._send(port, source.requests(now_ns), now_ns)
+                self._send_posted(port)
                 self._forgive_own_pause()
                 for source in self._sources:
                     source.check(now_ns)
@@ -258,6 +266,10 @@ class WireReader(Generic[WireT]):
                 port.set_baud(item.bits_per_s)
             else:
                 port.write(item)
+
+    def _send_posted(self, port: Port[WireT]) -> None:
+        while self._posted:
+            port.write(self._posted.popleft())
 
     def _give_up(self, why: str) -> None:
         """The wire is lost or cannot be opened: close it, tell everyone, come back after the back-off."""

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from drivers.encoder_arduino_bridge import ArduinoBridgeConversation
     from drivers.mavlink_in import MavlinkConversation
     from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
+    from service.mavlink_out import MavlinkOut
 
 
 @dataclass(frozen=True, slots=True)
@@ -496,6 +497,49 @@ def _sources(config: Config, references: Sequence[str] | None, found: Mapping[st
     if references is None:
         return frozenset(name for name, sensor in found.items() if isinstance(sensor, Laser | Chain))
     return frozenset(config.source_name(*config.resolve(reference)) for reference in references)
+
+
+# --- autopilots -------------------------------------------------------------------------------------------------------
+
+
+def mavlink_out(
+    config: Config, found: Mapping[str, Sensor], readers: Mapping[str, WireReader[Any]], clock: Clock
+) -> MavlinkOut | None:
+    """What sends a sector map to an autopilot, None if nothing shall. readers: by name of their wire.
+
+    On a port that a MAVLink source has too, it speaks through that source's reader.
+    """
+    wanted = config.mavlink
+    if not wanted.enabled:
+        return None
+    from service.mavlink_out import MavlinkOut, ReaderLink, Settings, sensor_type_of
+
+    name = wanted.map or next(iter(config.sectors.polar))
+    settings = Settings(
+        source=name,
+        footprint=config.robot.footprint_m,
+        system_id=wanted.system_id,
+        component_id=wanted.component_id,
+        rate_hz=wanted.rate_hz,
+        range_min_m=wanted.range_min_m,
+        range_max_m=wanted.range_max_m,
+        sensor_type=sensor_type_of(found[each].kind for each in _in_order(config, config.sectors.polar[name].sources)),
+    )
+    sharing = next((each for each in _mavlink_sources(config) if each[1] == wanted.port and each[0] in readers), None)
+    if sharing is not None:
+        return MavlinkOut(settings, partial(ReaderLink, readers[sharing[0]]), clock=clock)
+    if wanted.port.startswith(_UDP):
+        return MavlinkOut(settings, partial(_open_udp, wanted.port, clock), clock=clock)
+    return MavlinkOut(settings, partial(_open_serial, wanted.port, wanted.baud_bps, False, clock), clock=clock)
+
+
+def _mavlink_sources(config: Config) -> list[tuple[str, str]]:
+    """(source, port) of every MAVLink source; a wire is named like the first on it."""
+    return [
+        (config.source_name(section, name), device.port)
+        for section, name, device in config.devices()
+        if isinstance(device, MavlinkSonars | MavlinkWheels)
+    ]
 
 
 # --- warming up -------------------------------------------------------------------------------------------------------

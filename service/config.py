@@ -731,6 +731,41 @@ class Store(Section):
     )
 
 
+class Mavlink(Section):
+    """A polar sector map for an autopilot's obstacle avoidance: OBSTACLE_DISTANCE."""
+
+    enabled: bool = Field(default=False, description="Send it.")
+    map: Name | None = Field(default=None, description="The [sectors.polar.NAME] to send; default: the only one.")
+    port: str = Field(
+        default="udpout:127.0.0.1:14550",
+        min_length=1,
+        description="udpout:127.0.0.1:PORT, udpin:127.0.0.1:PORT, or a serial port.",
+    )
+    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed of a serial port.")
+    rate_hz: float = Field(default=15.0, ge=10, le=50, description="Messages a second, on a steady beat.")
+    system_id: int = Field(default=1, ge=1, le=255, description="That of the vehicle.")
+    component_id: int = Field(default=196, ge=1, le=255, description="Ours; 196 is obstacle avoidance.")
+    range_min_m: float = Field(default=0.1, gt=0, le=10, description="Nearer obstacles are told as this near.")
+    range_max_m: float = Field(default=10.0, gt=0, le=600, description="Farther ones are not told.")
+
+    @field_validator("port")
+    @classmethod
+    def _this_machine(cls, port: str) -> str:
+        if port.startswith("/"):
+            return port
+        from drivers.udp_port import parse_udp
+
+        if parse_udp(port) is None:
+            raise ValueError(f"{port!r} is neither a serial port (/dev/...) nor like udpout:127.0.0.1:14550")
+        return port
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Mavlink:
+        if self.range_min_m >= self.range_max_m:
+            raise ValueError("range_min_m must be below range_max_m")
+        return self
+
+
 class RecordingSettings(Section):
     """What happened, byte by byte, for `umfeld replay`."""
 
@@ -775,6 +810,7 @@ class Config(Section):
     network: Network = Field(default=Network(), description="The Zenoh router.")
     ros: Ros = Field(default=Ros(), description="ROS 2 beside our own keys.")
     store: Store = Field(default=Store(), description="The map on disk.")
+    mavlink: Mavlink = Field(default=Mavlink(), description="A sector map for an autopilot.")
     recording: RecordingSettings = Field(
         default=RecordingSettings(), description="What happened, byte by byte, for `umfeld replay`."
     )
@@ -967,6 +1003,9 @@ def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
                 known = [f"{each}.{one}" for each in SENSOR_SECTIONS for one in sorted(_table(data, each))]
                 text = f"there is no sensor {reference}; name one of: {', '.join(known) or '(none yet)'}"
                 yield Fault((*path, "sources"), text)
+    sent = _table(data, "mavlink").get("map")
+    if isinstance(sent, str) and sent not in _table(data, "sectors", "polar"):
+        yield _missing(("mavlink", "map"), sent, "sectors.polar", data)
     for name in _texts(_table(data, "artos").get("sources")):
         if name not in _table(data, "sectors", "polar"):
             yield _missing(("artos", "sources"), name, "sectors.polar", data)
@@ -974,11 +1013,14 @@ def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
 
 def _port_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
     taken: dict[str, tuple[str, str, Any]] = {}
-    claims = [
+    claims: list[tuple[KeyPath, Any, Any]] = [
         ((section, name, key), table.get(key), table.get("driver"))
         for section, key in (*((each, "port") for each in DEVICE_SECTIONS), ("can", "channel"))
         for name, table in _tables(data, section)
     ]
+    mavlink = _table(data, "mavlink")
+    if mavlink.get("enabled"):
+        claims.append((("mavlink", "port"), mavlink.get("port"), "mavlink"))
     for path, port, driver in claims:
         if not isinstance(port, str):
             continue
@@ -1014,5 +1056,9 @@ def _unused_faults(config: Config, data: Mapping[str, Any]) -> Iterator[Fault]:
             yield Fault(
                 ("wheels", name), f'no drive uses it; add source = "{name}" to [drive], with the wheels\' measures'
             )
+    polar = _table(data, "sectors", "polar")
+    if config.mavlink.enabled and config.mavlink.map is None and len(polar) != 1:
+        names = ", ".join(sorted(polar)) or "(none yet)"
+        yield Fault(("mavlink", "map"), f"say which [sectors.polar.NAME] to send, of: {names}")
     if config.artos.enabled and not _table(data, "sectors", "polar"):
         yield Fault(("artos", "enabled"), "the ARTOS map is made from polar sector maps; add a [sectors.polar.NAME]")

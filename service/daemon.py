@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from drivers.reader import WireReader
 from mapping.frames import IDENTITY, Pose2
@@ -35,7 +35,7 @@ from service.errors import Trouble
 from service.fusion import OdometryOnly
 from service.live_map import LiveMap, restore
 from service.locks import Claims
-from service.outputs import HealthOut
+from service.outputs import HealthOut, Output
 from service.payloads import RobotInfo, SensorPlace
 from service.publisher import Publisher
 from service.recording import RecordedFusion, Recorder
@@ -47,12 +47,16 @@ from service.systemd import Notifier
 from service.worker import Worker
 from service.zenoh_session import NetworkSettings, TlsFiles
 
+if TYPE_CHECKING:
+    from service.mavlink_out import MavlinkOut
+
 log = logging.getLogger(__name__)
 
 EXIT_DEADLINE_S = 8.0  # systemd would kill after 10
 _WIRE_STOP_S = 1.5
 _FUSION_STOP_S = 2.0
 _PUBLISHER_STOP_S = 2.0
+_MAVLINK_STOP_S = 1.0
 _GIL_SWITCH_S = 0.001  # a scan passes through three threads; by default each may wait 5 ms for the one that computes
 
 
@@ -68,6 +72,7 @@ class Daemon:
         self._readers: list[WireReader[Any]] = []
         self._clean = True
         self._meter = health.ProcessMeter(self._clock.now_ns())
+        self._mavlink: MavlinkOut | None = None
         self._recorder = Recorder(recording_settings(self._config), clock=self._clock)
 
     # --- the life of the process
@@ -130,7 +135,7 @@ class Daemon:
         self._fusion.recorder = self._recorder
         self._worker = Worker(
             self._fusion,
-            self._publisher.offer,
+            self._offer if config.mavlink.enabled else self._publisher.offer,
             now_ns=self._clock.now_ns,
             beat=self._notifier.beat,
             health=self._health,
@@ -142,6 +147,8 @@ class Daemon:
             self._parts.callback(self._finish_map, self._live_map)
         sink = self._recorder.sink(self._worker.sink)
         self._readers = [wire.reader(sink, self._clock.now_ns, self._recorder.tap(wire.name)) for wire in wires]
+        by_name = {reader.name: reader for reader in self._readers}
+        self._mavlink = assemble.mavlink_out(config, self._sensors, by_name, self._clock.now_ns)
         self._publisher.calls.register("record_start", self._on_record_start)
         self._publisher.calls.register("record_stop", lambda _arguments: self._end_recording())
         self._publisher.calls.register("record_status", lambda _arguments: self._recorder.status())
@@ -151,6 +158,9 @@ class Daemon:
         self._publisher.publish_info(robot_info(config, self._wall_ns()))
         self._worker.start()
         self._parts.callback(self._stop_worker)
+        if self._mavlink is not None:
+            self._parts.callback(self._mavlink.stop, _MAVLINK_STOP_S)
+            self._mavlink.start()
         if self._live_map is not None and store is not None:
             keeper = _Keeper(self._live_map, config.store.snapshot_period_s)
             self._parts.callback(keeper.stop)
@@ -196,8 +206,9 @@ class Daemon:
                 **{f"publish.{name}": count for name, count in self._publisher.counters().items()},
                 **({} if self._live_map is None else self._live_map.counters()),
                 **self._recorder.counters(),
+                **({} if self._mavlink is None else self._mavlink.counters()),
             },
-            troubles=[*self._fusion.troubles(now_ns), *self._map_troubles(), *self._recording_troubles()],
+            troubles=[*self._fusion.troubles(now_ns), *self._map_troubles(), *self._other_troubles()],
         )
         kinds = {name: sensor.kind for name, sensor in self._sensors.items()}
         wires = [reader.health() for reader in self._readers]
@@ -253,9 +264,15 @@ class Daemon:
         log.info("recorded: %s", ", ".join(done.get("files", ())))
         return done
 
-    def _recording_troubles(self) -> list[str]:
-        trouble = self._recorder.trouble()
-        return [] if trouble is None else [trouble]
+    def _other_troubles(self) -> list[str]:
+        troubles = (self._recorder.trouble(), None if self._mavlink is None else self._mavlink.trouble())
+        return [trouble for trouble in troubles if trouble is not None]
+
+    def _offer(self, output: Output) -> None:
+        """Where outputs go if an autopilot is to have them too."""
+        self._publisher.offer(output)
+        if self._mavlink is not None:
+            self._mavlink.offer(output)
 
     def _summary(self) -> str:
         config = self._config
