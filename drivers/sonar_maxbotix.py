@@ -133,7 +133,7 @@ class MaxBotixConversation:
         self._model = MODELS[family]
         self._form: Form = form
         self._channels = frozenset(channels) if channels is not None else None
-        count = len(self._channels) if self._channels and form == "labelled" else 1
+        count = len(self._channels) if self._channels and form != "single" else 1
         self._period_ns = round(period_s * 1e9) if period_s is not None else self._model.period_ns * count
         self._counters = SourceCounters()
         self._last_stamp_ns = _LONG_AGO
@@ -177,7 +177,9 @@ class MaxBotixConversation:
 
     @property
     def silence_limit_ns(self) -> int:
-        return min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        limit_ns = min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        # Lines of labelled sensors come in between; a list, or one slow sensor, may come less often than every 500 ms.
+        return max(limit_ns, self._period_ns * 3 // 2)
 
     # ---- how it is driven
 
@@ -261,8 +263,7 @@ class MaxBotixConversation:
     def _note_other(self, line: bytes, error: FrameError) -> None:
         """Greetings come before the values; afterwards a line that is none is damage."""
         text = line.decode("ascii", "replace").strip()
-        is_text = len(text) > 6 and sum(letter.isalpha() for letter in text) > len(text) // 2
-        if not self._running and is_text:
+        if error.reason == "bad_line" and not self._running and text.isprintable() and "\ufffd" not in text:
             self._greeting = self._greeting or text[:48]
         else:
             self._counters.drop(error.reason)

@@ -328,12 +328,21 @@ def conversation_of(device: Device) -> Conversation[Any]:
             from drivers.sonar_maxbotix import MaxBotixConversation
 
             return MaxBotixConversation(
-                device.family, form=device.lines, channels=_channels(device), period_s=1.0 / device.rate_hz
+                device.family, form=device.lines, channels=_channels(device), period_s=_maxbotix_period_s(device)
             )
         case ArduinoWheels() | ArduinoSonars() | MavlinkWheels() | MavlinkSonars():
             return _shares_of({"": device})[""]
         case _:
             raise TypeError(f"no driver for {type(device).__name__}")
+
+
+def _maxbotix_period_s(device: MaxBotixSonars) -> float:
+    """From one value of a channel to its next: as told, or as the family fires, one sensor after the other."""
+    from drivers.sonar_maxbotix import MODELS
+
+    if device.rate_hz is not None:
+        return 1.0 / device.rate_hz
+    return MODELS[device.family].period_ns * 1e-9 * max(len(device.transducers), 1)
 
 
 def _channels(board: UsBoardSonars | UsBoardSerialSonars | MaxBotixSonars) -> list[int] | None:
@@ -358,7 +367,9 @@ def _sensor_of(source: str, device: Device) -> Sensor:
                 math.radians(device.cone_deg),
                 device.range_min_m,
                 device.range_max_m,
-                round(1e9 / device.rate_hz),
+                round(
+                    1e9 * (_maxbotix_period_s(device) if isinstance(device, MaxBotixSonars) else 1.0 / device.rate_hz)
+                ),
             )
         case Cia406Wheels() | ArduinoWheels() | RoboClawWheels() | ODriveWheels() | VescWheels() | MavlinkWheels():
             return Wheels(source)

@@ -368,7 +368,9 @@ class MaxBotixSonars(_PlainSonars):
         default="single",
         description="single: one sensor, channel 1; labelled: `3:R1234`; list: `R123 R087` in order of channels.",
     )
-    rate_hz: float = Field(default=10.0, gt=0, le=50, description="How often each channel comes.")
+    rate_hz: float | None = Field(
+        default=None, gt=0, le=50, description="How often each channel comes; default: as the family, fired in turn."
+    )
 
     @model_validator(mode="after")
     def _one_on_a_line(self) -> MaxBotixSonars:

@@ -76,6 +76,7 @@ def test_a_greeting_is_no_fault_and_names_the_sensor() -> None:
     assert [before, conversation.state] == [LinkState.STARTING, LinkState.RUNNING]
     assert conversation.identity is not None
     assert conversation.identity.model == "HRXL-MaxSonar-WR"
+    assert conversation.counters.drops == {}
 
 
 @pytest.mark.parametrize("family", list(MODELS))
@@ -168,3 +169,10 @@ def test_random_bytes_raise_nothing_and_hardly_ever_pass() -> None:
     conversation = MaxBotixConversation("hr-5m")
     passed = sum(len(said(conversation, rng.randbytes(200))) for _ in range(2000))
     assert passed <= 1
+
+
+def test_slow_lists_are_not_taken_for_silence() -> None:
+    conversation = MaxBotixConversation("hr-5m", form="list", channels=(1, 2, 3))
+    assert conversation.silence_limit_ns > 500 * MS
+    assert MaxBotixConversation("lv").silence_limit_ns == 200 * MS
+    assert MaxBotixConversation("hr-5m").silence_limit_ns == 450 * MS
