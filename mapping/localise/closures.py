@@ -49,7 +49,8 @@ class ClosureSettings:
 
     apart_m: the way between two visits.  drift_m, drift_share: how far off a key may be after a way through the graph:
     the sum of both, at most search_m.  tracked_m: up to this drift no search is needed.  turn_rad_per_m: heading drift.
-    place_m: key scans on either side along the way that make up a place.  every_m: a place is searched for so often.
+    place_m: key scans on either side along the way that make up a place.  every_m: a place is searched for so
+    often, at most `searches` times in one piece of work.  score, rival: of a search, see Found.
     explained, refuted: shares of the points, see Agreement.  weakest_per_m2: least information in the worst direction.
     agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way.
     pending: how many closures wait at most.  undone_below: the weight under which a closure is forgotten in the end.
@@ -68,6 +69,7 @@ class ClosureSettings:
     place_m: float = 2.5
     places: int = 3
     every_m: float = 0.8
+    searches: int = 6
     score: float = 0.55
     rival: float = 0.93
     explained: float = 0.55
@@ -211,7 +213,8 @@ class Work:
                 tracked += self._track(key, place)
             # Where the search is wide, it is made more rarely: its cost grows with the square.
             every_m = max(self.settings.every_m, *(0.15 * self._drift(way_m[row][place]) for place in wide), 0.0)
-            if wide and self.snapshot.travel_m[key] - last_search_m >= every_m:
+            may_search = self._events["searches"] < self.settings.searches
+            if wide and may_search and self.snapshot.travel_m[key] - last_search_m >= every_m:
                 last_search_m = float(self.snapshot.travel_m[key])
                 searched += self._search(key, wide, way_m[row])
         return tracked, searched

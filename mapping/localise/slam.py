@@ -24,14 +24,14 @@ holds scans back and goes on with odometry and the last correction: both give th
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.frames import IDENTITY, Pose2, compose_covariance
+from mapping.frames import IDENTITY, Pose2, compose_covariance, exp_se2, log_se2
 from mapping.localise.closures import (
     Closure,
     ClosureSettings,
@@ -55,6 +55,9 @@ NEARBY = Reach((0.30, 0.22, 0.18, 0.15), (0.08, 0.06, 0.05, 0.04))
 HELD_PER_M2 = 2500.0  # the worst direction of a match is sure to 2 cm: it can judge odometry
 LEAST_FIT = 0.3  # of a view's points must be explained, or it says nothing about where it was taken
 UNMATCHED_PATIENCE = 4.0  # a sweep that fits nothing may be dust, a crowd or a slope: wait before it is kept
+VELOCITY_OVER_S = 0.15
+FASTEST_M_S = 20.0
+FASTEST_RAD_S = 4.0
 CLEARLY = 1.1  # times better a match must be to be believed against the prediction
 
 
@@ -198,7 +201,8 @@ class Slam:
         self._scan_key: list[int] = []
         self._scan_in_key: list[tuple[float, float, float]] = []  # base pose in the key scan's sensor frame
         self._last: tuple[int, Pose2, Pose2 | None] | None = None  # stamp, map_from_base, odom_from_base
-        self._velocity: F64 = np.zeros(3)
+        self._velocity: F64 = np.zeros(3)  # a twist of the base in its own frame [m/s, m/s, rad/s]
+        self._recent: deque[tuple[int, Pose2]] = deque(maxlen=64)
         self._trust = _Trust(self.settings.odometry_factor)
         self._lost_scans = 0
         self._key_odom: Pose2 | None = None  # of the sensor, at the newest key scan
@@ -263,10 +267,10 @@ class Slam:
             sigma_m, sigma_rad = self._odometry_sigma(math.hypot(step.x_m, step.y_m), abs(step.yaw_rad))
             return _Place(last_pose @ step @ base_from_sensor, last_pose @ step, sigma_m, sigma_rad, True)
         seconds = min(max((stamp_ns - last_ns) * 1e-9, 0.0), 0.5)
-        vx, vy, w = (float(v) for v in self._velocity * seconds)
-        sigma_m = 0.05 + 2.0 * seconds**2 + 0.3 * math.hypot(vx, vy)
-        sigma_rad = math.radians(3.0) + 3.0 * seconds**2 + 0.3 * abs(w)
-        ahead = last_pose @ Pose2(vx, vy, w)
+        way = self._velocity * seconds
+        sigma_m = 0.05 + 2.0 * seconds**2 + 0.3 * math.hypot(way[0], way[1])
+        sigma_rad = math.radians(3.0) + 3.0 * seconds**2 + 0.3 * abs(float(way[2]))
+        ahead = last_pose @ exp_se2(way)
         return _Place(ahead @ base_from_sensor, ahead, sigma_m, sigma_rad, False)
 
     def _odometry_sigma(self, way_m: float, turn_rad: float) -> tuple[float, float]:
@@ -417,8 +421,7 @@ class Slam:
         """Note where a scan was, and say it."""
         key = len(self._views) - 1
         map_from_base = map_from_sensor @ base_from_sensor.inverse()
-        if self._last is not None:
-            self._note_velocity(stamp_ns, map_from_base)
+        self._note_velocity(stamp_ns, map_from_base, matched=match is not None or is_key)
         self._last = (stamp_ns, map_from_base, odom)
         key_pose = self._key_pose(key)
         in_key = key_pose.inverse() @ map_from_base
@@ -433,15 +436,28 @@ class Slam:
             covariance = covariance + np.diag([0.05**2, 0.05**2, math.radians(3.0) ** 2]) * (1 + self._lost_scans)
         return SlamUpdate(stamp_ns, map_from_base, covariance, match is not None or key == 0, key, is_key, self.epoch)
 
-    def _note_velocity(self, stamp_ns: int, map_from_base: Pose2) -> None:
-        """Keep the motion of the base a second, in its own frame, for scans without odometry."""
-        assert self._last is not None
-        seconds = (stamp_ns - self._last[0]) * 1e-9
-        if not 0.0 < seconds < 1.0:
+    def _note_velocity(self, stamp_ns: int, map_from_base: Pose2, *, matched: bool) -> None:
+        """Keep the motion of the base a second, in its own frame, for scans without odometry.
+
+        Taken over at least VELOCITY_OVER_S, because stamps of single scans may be off by as much as a scan lasts.
+        What was only predicted says nothing about motion; a robot that is lost is taken to stand.
+        """
+        if not matched:
+            self._recent.clear()
+            self._velocity = 0.5 * self._velocity
+            return
+        self._recent.append((stamp_ns, map_from_base))
+        while len(self._recent) > 2 and (stamp_ns - self._recent[1][0]) * 1e-9 >= VELOCITY_OVER_S:
+            self._recent.popleft()
+        before_ns, before = self._recent[0]
+        seconds = (stamp_ns - before_ns) * 1e-9
+        if not VELOCITY_OVER_S <= seconds < 1.5:
             self._velocity = np.zeros(3)
             return
-        step = self._last[1].inverse() @ map_from_base
-        self._velocity = np.array([step.x_m, step.y_m, step.yaw_rad]) / seconds
+        step = before.inverse() @ map_from_base
+        speed = log_se2(step) / seconds
+        plausible = math.hypot(speed[0], speed[1]) < FASTEST_M_S and abs(speed[2]) < FASTEST_RAD_S
+        self._velocity = speed if plausible else np.zeros(3)
 
     # --- the back end
 
@@ -480,6 +496,7 @@ class Slam:
             if self._last is not None:
                 stamp, pose, odom = self._last
                 self._last = (stamp, correction @ pose, odom)
+            self._recent = deque(((t, correction @ p) for t, p in self._recent), maxlen=self._recent.maxlen)
         if moved > 0.01:
             self.epoch += 1
         self._pending, self.closures, self.closure_weight = result.pending, result.closures, result.weight
