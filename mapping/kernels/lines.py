@@ -348,14 +348,19 @@ def trim(x: Any, y: Any, first: int, last: int, rules: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def fit(x: Any, y: Any, first: int, last: int, rules: Any, row: Any) -> Any:
-    """One run's line (S05, S06): trimmed, weighted regression, ends shifted onto it. False if it is too short or
-    has too few points. Points come counter-clockwise, so the line goes from the last to the first (S08)."""
+    """One run's line (S05, S06): trimmed, weighted regression, ends shifted onto it.
+
+    False if it is too short, has too few points, or they scatter by more than the tolerance (rms).
+    Points come counter-clockwise, so the line goes from the last to the first (S08).
+    """
     first, last = trim(x, y, first, last, rules)
     if last - first + 1 < rules[MIN_POINTS]:
         return False
     n, cx, cy, a, b, c = moments(x, y, first, last + 1)
     gamma = 0.5 * math.atan2(2.0 * b, a - c)
     w, cx, cy, a, b, c = weighted_moments(x, y, first, last, -math.sin(gamma), math.cos(gamma), rules)
+    if residual(a, b, c) > w * tolerance(cx, cy, rules) ** 2:
+        return False  # a heap of points, not a wall
     gamma = 0.5 * math.atan2(2.0 * b, a - c)
     ux, uy = math.cos(gamma), math.sin(gamma)
     start = ux * (x[last] - cx) + uy * (y[last] - cy)

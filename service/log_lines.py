@@ -1,0 +1,95 @@
+"""Lines of a recorded log: of one scan, or of the whole run as a map (`umfeld extract lines`)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.logs import Log, LogError, read_log
+from mapping.frames import Pose2
+from mapping.lines.extract import LineExtractor, LineRules
+from mapping.lines.line_map import LineMap
+from mapping.lines.lines import Lines
+from service.errors import WrongUsage
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class LogLines:
+    """lines in `frame`: "map", or "laser" for a single scan.
+
+    report: for people and programs; map_bytes are those of the compact form, scan_bytes those of the ranges as 4-byte
+    numbers.
+    """
+
+    lines: Lines
+    frame: str
+    report: dict[str, object]
+
+
+def lines_of_log(
+    path: Path,
+    *,
+    scan: int | None = None,
+    every: int = 1,
+    min_seen: int = 2,
+    rules: LineRules | None = None,
+    progress: Progress | None = None,
+) -> LogLines:
+    """Read a log and find its lines.
+
+    scan: only this scan (from 0; negative from the end), in the frame of its laser.  every: only every N-th scan.
+    min_seen: leave out what fewer scans saw.  Raises WrongUsage if the log cannot be read or has no such scan.
+    """
+    try:
+        log = read_log(path)
+    except (LogError, OSError) as error:
+        raise WrongUsage(str(error)) from error
+    if scan is not None:
+        return _of_one_scan(log, scan, rules)
+    return _of_run(log, every, min_seen, rules, progress)
+
+
+def _of_one_scan(log: Log, number: int, rules: LineRules | None) -> LogLines:
+    count = len(log.scans)
+    if not -count <= number < count:
+        raise WrongUsage(f"{log.provenance.path}: has scans 0 to {count - 1}, not {number}")
+    chosen = log.scans[number]
+    lines = LineExtractor(chosen.bearing_rad, rules, range_max_m=log.range_max_m).extract(chosen.range_m)
+    report = {"log": log.provenance.path, "scan": number % count, "stamp": chosen.stamp_text, "lines": len(lines)}
+    return LogLines(lines, "laser", report)
+
+
+def _of_run(log: Log, every: int, min_seen: int, rules: LineRules | None, progress: Progress | None) -> LogLines:
+    scans = log.scans[::every]
+    extractors: dict[int, LineExtractor] = {}
+    line_map, found = LineMap(), 0
+    started = time.monotonic()
+    for index, each in enumerate(scans):
+        key = id(each.bearing_rad)  # shared between the scans of a device
+        if key not in extractors:
+            extractors[key] = LineExtractor(each.bearing_rad, rules, range_max_m=log.range_max_m)
+        lines = extractors[key].extract(each.range_m)
+        found += len(lines)
+        line_map.insert(lines, Pose2(*each.laser_pose))
+        if progress is not None and index % 64 == 0:
+            progress(index, len(scans))
+    kept = line_map.lines(min_seen=min_seen)
+    map_bytes = len(line_map.to_bytes(min_seen=min_seen))
+    scan_bytes = sum(4 * each.range_m.size for each in scans)
+    report: dict[str, object] = {
+        "log": log.provenance.path,
+        "poses": log.poses.value,
+        "scans": len(scans),
+        "lines_in_scans": found,
+        "lines": len(kept),
+        "length_m": round(float(kept.length_m.sum()), 3),
+        "map_bytes": map_bytes,
+        "scan_bytes": scan_bytes,
+        "times_smaller": round(scan_bytes / max(map_bytes, 1), 1),
+        "seconds": round(time.monotonic() - started, 3),
+    }
+    return LogLines(kept, "map", report)
