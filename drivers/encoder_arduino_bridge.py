@@ -75,7 +75,7 @@ def encode_question(letter: str, pin: int | None = None) -> bytes:
 
 def decode_line(line: bytes) -> tuple[int, ...] | None:
     """The one or two numbers of an answer (CR LF taken off), None for Invalid Command. FrameError for anything else."""
-    text = line.decode("ascii", "replace")
+    text = line.decode("ascii", "replace").strip(" ")  # some sketches print a blank before or after
     if text == INVALID_COMMAND:
         return None
     if not _NUMBERS.fullmatch(text):

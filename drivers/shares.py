@@ -68,7 +68,8 @@ class _Share(Generic[WireT]):
 
     @property
     def trouble(self) -> str | None:
-        return self._hub.device.trouble_of(self._kind) or self._hub.device.trouble
+        device = self._hub.device  # whose own trouble, once it answers, is that of all its shares
+        return device.trouble if device.state is LinkState.SILENT else device.trouble_of(self._kind)
 
     @property
     def identity(self) -> Identity | None:
