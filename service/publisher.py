@@ -47,6 +47,7 @@ class Outbox:
     def put(self, slot: str, parcel: Parcel, *, depth: int = 1, supersedes: str | None = None) -> None:
         """Add a parcel; beyond depth the slot's oldest is lost. supersedes: a slot that this parcel empties."""
         with self._changed:
+            was_empty = not self._slots
             if supersedes is not None and (old := self._slots.pop(supersedes, None)):
                 self.dropped[supersedes] += len(old)
             waiting = self._slots.setdefault(slot, deque())
@@ -54,7 +55,8 @@ class Outbox:
             if len(waiting) > depth:
                 waiting.popleft()
                 self.dropped[slot] += 1
-            self._changed.notify()
+            if was_empty:  # else the one that takes is awake; waking costs more than all else here
+                self._changed.notify()
 
     def take(self) -> Parcel | None:
         """The parcel that waited longest, waiting for one; None when closed and empty."""

@@ -56,6 +56,7 @@ class _Channel:
     held_v: F64
     held_stamp_ns: I64
     held_dead: Bool
+    holds: bool  # held_* are its own, not those that stand for nothing held
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,15 @@ class Evidence:
         self._limits = limits
         self._channels: dict[tuple[int, int], _Channel] = {}
         self._heard = [not wait_for_sources] * len(sources)
+        self._nothing_held = (
+            np.full(count, np.inf),
+            np.full(count, np.nan),
+            np.full(count, np.nan),
+            np.zeros(count, dtype=np.int64),
+            np.zeros(count, dtype=bool),
+        )
+        for each in self._nothing_held:
+            each.setflags(write=False)
 
     def index(self, source: str) -> int:
         """Of a source by name; ValueError names the ones there are."""
@@ -107,18 +117,13 @@ class Evidence:
         old = self._channels.get((at, channel))
         if old is not None and not old.dead and stamp_ns < old.stamp_ns:
             return
-        new = _Channel(
-            at,
-            stamp_ns,
-            False,
-            finding,
-            np.full(self._count, np.inf),
-            np.full(self._count, np.nan),
-            np.full(self._count, np.nan),
-            np.zeros(self._count, dtype=np.int64),
-            np.zeros(self._count, dtype=bool),
-        )
-        if old is not None and looked is not None:
+        if old is None or looked is None:
+            new = _Channel(at, stamp_ns, False, finding, *self._nothing_held, holds=False)
+        else:
+            m, u, v, stamps, dead = self._nothing_held
+            new = _Channel(
+                at, stamp_ns, False, finding, m.copy(), u.copy(), v.copy(), stamps.copy(), dead.copy(), holds=True
+            )
             _hold(new, old, looked)
         self._channels[at, channel] = new
 
@@ -134,7 +139,8 @@ class Evidence:
         for channel in self._channels.values():
             if channel.source == at:
                 channel.dead = True
-                channel.held_dead[:] = True
+                if channel.holds:
+                    channel.held_dead[:] = True
 
     def verdict(self, now_ns: int) -> Verdict:
         """What is known of each sector at an instant."""
@@ -196,18 +202,24 @@ class Evidence:
     def _table(self, now_ns: int) -> tuple[F64, F64, F64, F64, I64, Bool, I64, Bool]:
         # One row for each finding in force, then one for what each channel still holds from earlier ones.
         channels = [self._channels[key] for key in sorted(self._channels)]
-        holding = [c for c in channels if np.isfinite(c.held_m).any()]
-        none, nowhere = np.zeros(self._count), np.zeros(self._count, dtype=bool)
-        obstacle = np.stack([c.finding.obstacle_m for c in channels] + [c.held_m for c in holding])
-        u = np.stack([c.finding.u for c in channels] + [c.held_u for c in holding])
-        v = np.stack([c.finding.v for c in channels] + [c.held_v for c in holding])
-        free = np.stack([c.finding.free_m for c in channels] + [none] * len(holding))
-        blind = np.stack([c.finding.blind for c in channels] + [nowhere] * len(holding))
-        stamp = np.stack([np.full(self._count, c.stamp_ns) for c in channels] + [c.held_stamp_ns for c in holding])
-        fresh = np.stack(
-            [np.full(self._count, not c.dead) for c in channels]
-            + [~c.held_dead & (now_ns - c.held_stamp_ns <= self._limits[c.source]) for c in holding]
-        )
+        holding = [c for c in channels if c.holds and np.isfinite(c.held_m).any()]
+        shape = (len(channels) + len(holding), self._count)
+        obstacle, u, v, free = np.empty(shape), np.empty(shape), np.empty(shape), np.zeros(shape)
+        blind, fresh = np.zeros(shape, dtype=bool), np.empty(shape, dtype=bool)
+        stamp = np.empty(shape, dtype=np.int64)
+        for row, c in enumerate(channels):
+            found = c.finding
+            obstacle[row], u[row], v[row], free[row], blind[row] = (
+                found.obstacle_m,
+                found.u,
+                found.v,
+                found.free_m,
+                found.blind,
+            )
+            stamp[row], fresh[row] = c.stamp_ns, not c.dead
+        for row, c in enumerate(holding, start=len(channels)):
+            obstacle[row], u[row], v[row], stamp[row] = c.held_m, c.held_u, c.held_v, c.held_stamp_ns
+            fresh[row] = ~c.held_dead & (now_ns - c.held_stamp_ns <= self._limits[c.source])
         source = np.array([c.source for c in channels] + [c.source for c in holding])
         return obstacle, u, v, free, stamp, fresh, source, blind
 

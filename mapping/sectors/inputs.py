@@ -13,6 +13,10 @@ from mapping.sectors.sight import Sight, arc_of_cone, end_points, median_spacing
 
 F64 = NDArray[np.float64]
 
+CONES_REMEMBERED = 512
+"""How many of its findings about cones a map keeps: sonars stand still on the robot and tell whole centimetres or
+less, so the same few distances come again and again, and what each says of the sectors is worked out once."""
+
 
 class SpacingMemory:
     """The finest spacing of beams each source has shown: a scan that lost every other beam must not pass for whole."""

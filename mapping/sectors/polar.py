@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +12,7 @@ from mapping.frames import IDENTITY, Pose2
 from mapping.kernels import sectors as kernels
 from mapping.sectors.evidence import Evidence, Finding
 from mapping.sectors.footprint import Outline, checked_polygon
-from mapping.sectors.inputs import SpacingMemory, checked_beams, see_beams, see_cone, without_self
+from mapping.sectors.inputs import CONES_REMEMBERED, SpacingMemory, checked_beams, see_beams, see_cone, without_self
 from mapping.sectors.sight import Sight, arc_of_cone
 from mapping.sectors.snapshot import PolarSnapshot, SectorState
 
@@ -73,6 +74,7 @@ class PolarSectors:
         self._footprint = checked_polygon(footprint) if footprint is not None and self_filter else None
         self._frame = _Wedges(self.edges_rad, sector_rad, range_max_m, self._outline)
         self._spacing = SpacingMemory()
+        self._heard = lru_cache(CONES_REMEMBERED)(self._find_in_cone)
         self._evidence = Evidence(
             count=len(self.edges_rad) - 1,
             sources=tuple(sources),
@@ -136,6 +138,7 @@ class PolarSectors:
         cone_rad: full opening angle.  An echo counts for every sector its arc passes, at the arc's nearest point
         there and the bearing of its point nearest to the axis.  Raises ValueError for an unknown source.
         """
+        self._evidence.index(source)
         pose = self._virtual_from_base @ base_from_transducer
         count = len(self.edges_rad) - 1
         if math.isnan(range_m) or (math.isfinite(range_m) and range_m < 0.0):
@@ -144,6 +147,12 @@ class PolarSectors:
             finding = Finding(np.full(count, np.inf), nowhere, nowhere, np.zeros(count), blind)
             self._evidence.nothing_heard(source, channel, finding, stamp_ns=stamp_ns)
             return
+        finding = self._heard(pose, cone_rad, range_m, range_min_m, range_max_m)
+        self._evidence.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
+
+    def _find_in_cone(
+        self, pose: Pose2, cone_rad: float, range_m: float, range_min_m: float, range_max_m: float
+    ) -> Finding:
         sight, arc, off_axis = see_cone(
             range_m,
             cone_rad=cone_rad,
@@ -155,8 +164,7 @@ class PolarSectors:
         nearest_m, at_rad = self._frame.nearest_of_arc(arc, off_axis)
         free_m = self._frame.free(sight)
         free_m[~self._frame.ends_in_cone(free_m, cone_rad, pose)] = 0.0
-        finding = Finding(nearest_m, at_rad, at_rad, free_m, np.zeros(count, dtype=bool))
-        self._evidence.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
+        return Finding(nearest_m, at_rad, at_rad, free_m, np.zeros(len(free_m), dtype=bool))
 
     def lost(self, source: str) -> None:
         """The device is gone: its evidence is stale now, not only when its time is up."""
@@ -248,4 +256,7 @@ class _Wedges:
 
 
 def _points(distance_m: F64, bearing_rad: F64) -> F64:
-    return np.stack((distance_m * np.cos(bearing_rad), distance_m * np.sin(bearing_rad)), axis=-1)
+    points = np.empty((len(distance_m), 2))
+    points[:, 0] = distance_m * np.cos(bearing_rad)
+    points[:, 1] = distance_m * np.sin(bearing_rad)
+    return points

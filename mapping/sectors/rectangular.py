@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +12,7 @@ from mapping.frames import IDENTITY, Pose2
 from mapping.kernels import sectors as kernels
 from mapping.sectors.evidence import Evidence, Finding
 from mapping.sectors.footprint import Outline, checked_polygon
-from mapping.sectors.inputs import SpacingMemory, checked_beams, see_beams, see_cone, without_self
+from mapping.sectors.inputs import CONES_REMEMBERED, SpacingMemory, checked_beams, see_beams, see_cone, without_self
 from mapping.sectors.sight import Sight, arc_of_cone
 from mapping.sectors.snapshot import RectSnapshot
 
@@ -55,6 +56,7 @@ class RectSectors:
             raise ValueError(f"{self._shape[0]} x {self._shape[1]} sectors are too many: enlarge sector_m")
         self._raster = _Raster(self.x_edges_m, self.y_edges_m, sector_m, Outline(footprint, base_from_sensor))
         self._spacing = SpacingMemory()
+        self._heard = lru_cache(CONES_REMEMBERED)(self._find_in_cone)
         self._evidence = Evidence(
             count=self._shape[0] * self._shape[1],
             sources=tuple(sources),
@@ -110,6 +112,7 @@ class RectSectors:
         stamp_ns: int,
     ) -> None:
         """Take one sonar's range; as PolarSectors.update_cone. An echo counts in every square its arc passes."""
+        self._evidence.index(source)
         pose = self._virtual_from_base @ base_from_transducer
         count = self._shape[0] * self._shape[1]
         if math.isnan(range_m) or (math.isfinite(range_m) and range_m < 0.0):
@@ -118,6 +121,12 @@ class RectSectors:
             finding = Finding(np.full(count, np.inf), nowhere, nowhere, np.zeros(count), blind)
             self._evidence.nothing_heard(source, channel, finding, stamp_ns=stamp_ns)
             return
+        finding = self._heard(pose, cone_rad, range_m, range_min_m, range_max_m)
+        self._evidence.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
+
+    def _find_in_cone(
+        self, pose: Pose2, cone_rad: float, range_m: float, range_min_m: float, range_max_m: float
+    ) -> Finding:
         sight, arc, _ = see_cone(
             range_m,
             cone_rad=cone_rad,
@@ -127,8 +136,7 @@ class RectSectors:
             virtual_from_transducer=pose,
         )
         nearest_m, x, y = self._raster.along(arc)
-        finding = Finding(nearest_m, x, y, self._raster.free(sight), np.zeros(count, dtype=bool))
-        self._evidence.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
+        return Finding(nearest_m, x, y, self._raster.free(sight), np.zeros(len(nearest_m), dtype=bool))
 
     def lost(self, source: str) -> None:
         """The device is gone: its evidence is stale now, not only when its time is up."""

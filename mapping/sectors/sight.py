@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,18 +118,36 @@ def sight_of_cone(*, cone_rad: float, free_m: float, near_m: float, virtual_from
     wave of the transducer's size there, not yet a cone.
     """
     half = 0.5 * cone_rad
-    pieces = max(1, math.ceil(cone_rad / _CONE_STEP_RAD))
-    cuts = np.linspace(-half, half, pieces + 1)
+    with_front = near_m > 0.0 and half < _FRONT_RAD
+    lo, hi, ahead = _cone_pieces(cone_rad, with_front)
+    length = np.where(ahead, max(free_m, near_m) if with_front else free_m, near_m)
+    sees = (length > 0.0) & np.isfinite(length)
+    return Sight(virtual_from_transducer, lo[sees], hi[sees], length[sees], np.array([-half]), np.array([half]))
+
+
+@lru_cache(64)
+def _cone_pieces(cone_rad: float, with_front: bool) -> tuple[F64, F64, Bool]:
+    """Thin sectors of a cone, or of everything ahead, and which of them are the cone's."""
+    half = 0.5 * cone_rad
+    cuts = np.linspace(-half, half, max(1, math.ceil(cone_rad / _CONE_STEP_RAD)) + 1)
     lo, hi = cuts[:-1], cuts[1:]
-    length = np.full(pieces, free_m)
-    if near_m > 0.0 and half < _FRONT_RAD:
+    sides = 0
+    if with_front:
         side = np.linspace(half, _FRONT_RAD, max(1, math.ceil((_FRONT_RAD - half) / _CONE_STEP_RAD)) + 1)
         lo = np.concatenate((-side[:0:-1], lo, side[:-1]))
         hi = np.concatenate((-side[-2::-1], hi, side[1:]))
-        near = np.full(len(side) - 1, near_m)
-        length = np.concatenate((near, np.maximum(length, near_m), near))
-    sees = (length > 0.0) & np.isfinite(length)
-    return Sight(virtual_from_transducer, lo[sees], hi[sees], length[sees], np.array([-half]), np.array([half]))
+        sides = len(side) - 1
+    ahead = np.zeros(len(lo), dtype=bool)
+    ahead[sides : len(lo) - sides] = True
+    return lo, hi, ahead
+
+
+@lru_cache(64)
+def _arc_directions(cone_rad: float) -> tuple[F64, F64, F64]:
+    """(M,) angles off the axis along an arc, their cosines and sines."""
+    half_steps = max(1, math.ceil(0.5 * cone_rad / _ARC_STEP_RAD))
+    off = np.linspace(-0.5 * cone_rad, 0.5 * cone_rad, 2 * half_steps + 1)
+    return np.abs(off), np.cos(off), np.sin(off)
 
 
 def end_points(bearing_rad: F64, range_m: F64, *, range_min_m: float, virtual_from_sensor: Pose2) -> F64:
@@ -141,7 +160,8 @@ def end_points(bearing_rad: F64, range_m: F64, *, range_min_m: float, virtual_fr
 
 def arc_of_cone(*, cone_rad: float, range_m: float, virtual_from_transducer: Pose2) -> tuple[F64, F64]:
     """(M, 2) points along the arc an echo may have come from, and (M,) how far each is off the axis, in radians."""
-    half_steps = max(1, math.ceil(0.5 * cone_rad / _ARC_STEP_RAD))
-    off = np.linspace(-0.5 * cone_rad, 0.5 * cone_rad, 2 * half_steps + 1)
+    off_axis, c, s = _arc_directions(cone_rad)
     r = max(range_m, _LEAST_RANGE_M)
-    return virtual_from_transducer.apply(np.stack((r * np.cos(off), r * np.sin(off)), axis=-1)), np.abs(off)
+    points = np.empty((len(off_axis), 2))
+    points[:, 0], points[:, 1] = r * c, r * s
+    return virtual_from_transducer.apply(points), off_axis
