@@ -35,6 +35,7 @@ from drivers.readings import F64, SourceCounters
 STX = b"\x02\x02\x02\x02"
 MAX_PAYLOAD = 60_000
 _KIND = re.compile(rb"s[A-Z][A-Z]")
+_NAMED = re.compile(rb"s[A-Z][A-Z]( [A-Za-z][A-Za-z0-9]*( |$)|$)|sFA")
 _FIXED = struct.Struct(">HHIHHHIIHHHIIH")
 _CHANNEL = struct.Struct(">5sffiHH")
 SCAN_HEADS = (b"sSN LMDscandata ", b"sRA LMDscandata ")
@@ -47,19 +48,19 @@ def encode_telegram(payload: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Telegram:
-    """A payload and the stamp of the chunk with its last byte."""
+    """A payload and the stamp of the chunk with its last byte. scan: what it holds, if it is LMDscandata."""
 
     payload: bytes
     arrived_ns: int
-
-    @property
-    def is_scan(self) -> bool:
-        """Whether it holds LMDscandata."""
-        return self.payload.startswith(SCAN_HEADS)
+    scan: ScanData | None = None
 
 
 class TelegramReader:
-    """Whole telegrams from chunks. What does not fit is looked at again from its second byte."""
+    """Whole telegrams from chunks. What does not fit is looked at again from its second byte.
+
+    A telegram that has begun does not hold up a whole one behind its begin: then it was none, or was cut. A scan whose
+    layout is odd although its sum is right does not swallow what lies in it: the sum has 8 bits only.
+    """
 
     def __init__(self, counters: SourceCounters | None = None) -> None:
         self._counters = counters or SourceCounters()
@@ -68,15 +69,6 @@ class TelegramReader:
     def clear(self) -> None:
         """Forget a telegram that has only begun."""
         self._buffer.clear()
-
-    def abandon_partial(self, now_ns: int) -> list[Telegram]:
-        """What has begun will not be completed: the telegrams that were held up behind it."""
-        found: list[Telegram] = []
-        while self._buffer and not found:
-            self._counters.drop("noise_bytes")
-            del self._buffer[0]
-            found = self.feed(b"", now_ns)
-        return found
 
     def feed(self, chunk: bytes, stamp_ns: int) -> list[Telegram]:
         """Telegrams that this chunk completes."""
@@ -90,14 +82,27 @@ class TelegramReader:
             at = begin
             size = _size_at(data, at)
             if size is None or at + size > len(data):
-                break
+                whole = _whole_behind(data, at)
+                if whole is None:
+                    break
+                self._count_noise(whole - at)
+                at = whole
+                continue
             payload = data[at + 8 : at + size - 1]
             if size == 0 or _sum(payload) != data[at + size - 1]:
                 self._counters.drop("bad_sum" if size else "noise_bytes")
                 at += 1
                 continue
-            found.append(Telegram(payload, stamp_ns))
-            at += size
+            try:
+                if _NAMED.match(payload) is None:
+                    raise FrameError("bad_layout")
+                scan = decode_scan(payload) if payload.startswith(SCAN_HEADS) else None
+            except FrameError as error:
+                self._counters.drop(error.reason)
+                at += 1
+                continue
+            found.append(Telegram(payload, stamp_ns, scan))
+            at += 1 if scan is not None and scan.tail_is_odd else size
         del self._buffer[:at]
         return found
 
@@ -122,6 +127,15 @@ def _size_at(data: bytes, at: int) -> int | None:
     if not 4 <= length <= MAX_PAYLOAD or _KIND.match(data, at + 8) is None:
         return 0
     return length + 9
+
+
+def _whole_behind(data: bytes, at: int) -> int | None:
+    """Where a whole telegram begins behind this place, if there is one."""
+    while (at := data.find(STX, at + 1)) >= 0:
+        size = _size_at(data, at)
+        if size and at + size <= len(data) and _sum(data[at + 8 : at + size - 1]) == data[at + size - 1]:
+            return at
+    return None
 
 
 def _sum(payload: bytes) -> int:
@@ -165,8 +179,8 @@ def decode_scan(payload: bytes) -> ScanData:
         fixed = _FIXED.unpack_from(data)
         _, _, serial, status, telegrams, scans, scan_us, sent_us, _, _, _, frequency, beams, encoders = fixed
         at = _FIXED.size
-        if encoders > 3:
-            raise FrameError("bad_layout", f"{encoders} encoders")
+        if encoders > 3 or frequency == 0:
+            raise FrameError("bad_layout", f"{encoders} encoders, {frequency / 100} Hz")
         at += 6 * encoders
         channels, at = _channels(data, at, 2)
         bytes_channels, at = _channels(data, at, 1)
@@ -195,7 +209,7 @@ def _channels(data: bytes, at: int, width: int) -> tuple[dict[str, Channel], int
     for _ in range(count):
         name, scale, offset, first, step, values = _CHANNEL.unpack_from(data, at)
         at += _CHANNEL.size
-        if not (name.isalnum() and math.isfinite(scale) and math.isfinite(offset)) or scale <= 0.0:
+        if not (name.isalnum() and math.isfinite(scale) and math.isfinite(offset)) or scale <= 0.0 or step == 0:
             raise FrameError("bad_layout", repr(name))
         if at + width * values > len(data):
             raise FrameError("bad_layout", f"{values} values")

@@ -24,13 +24,11 @@ from drivers.cola import (
     Telegram,
     TelegramReader,
     decode_identity,
-    decode_scan,
     encode_telegram,
     exact_step_deg,
     trouble_of_status,
 )
 from drivers.conversation import SetBaudRate
-from drivers.errors import FrameError
 from drivers.readings import F64, ClockFit, Identity, LinkState, Reading, ScanReading
 from drivers.scripted import ScriptedConversation, Step, pause
 from drivers.turns import Limits, NoEcho
@@ -119,7 +117,7 @@ class SickColaConversation(ScriptedConversation[Telegram]):
         """Ask who it is until anything in CoLa binary comes back."""
         while True:
             heard_bytes = self._counters.bytes
-            reply = yield Step((IDENTIFY,), lambda reply: not reply.is_scan, REPLY_NS)
+            reply = yield Step((IDENTIFY,), lambda reply: reply.scan is None, REPLY_NS)
             if reply is not None:
                 if reply.payload.startswith(b"sRA DeviceIdent"):
                     self._name = decode_identity(reply.payload)
@@ -160,7 +158,7 @@ class SickColaConversation(ScriptedConversation[Telegram]):
         return False
 
     def _awaiting_scans(self, wait_ns: int) -> Step[Telegram]:
-        return Step((), lambda telegram: telegram.is_scan, wait_ns)
+        return Step((), lambda telegram: telegram.scan is not None, wait_ns)
 
     def _note_identity(self) -> None:
         serial = "" if self._serial is None else f"{self._serial:08d}"
@@ -171,24 +169,16 @@ class SickColaConversation(ScriptedConversation[Telegram]):
     def _messages(self, chunk: bytes, stamp_ns: int) -> Iterable[Telegram]:
         return self._telegrams.feed(chunk, stamp_ns)
 
-    def _overdue(self, now_ns: int) -> Iterable[Telegram]:
-        return self._telegrams.abandon_partial(now_ns)
-
     def _take(self, telegram: Telegram, stamp_ns: int) -> Iterator[Reading]:
-        if not telegram.is_scan:
+        scan = telegram.scan
+        if scan is None:
             return
         if self._period_ns is None:
             self._counters.drop("leftover_scan")
             return
-        try:
-            scan = decode_scan(telegram.payload)
-            distance = scan.channels.get("DIST1")
-            if distance is None or len(distance.raw) == 0:
-                raise FrameError("no_distances")
-            if scan.scans_per_s <= 0.0 or distance.step_deg <= 0.0:
-                raise FrameError("bad_layout")
-        except FrameError as error:
-            self._counters.drop(error.reason)
+        distance = scan.channels.get("DIST1")
+        if distance is None or len(distance.raw) == 0:
+            self._counters.drop("no_distances")
             return
         if not self._believes(scan):
             return

@@ -282,13 +282,6 @@ class SickLms2xxConversation(ScriptedConversation[Telegram]):
         self._heard += sum(each.size > 1 for each in telegrams) + (chunk == bytes([ACK]))
         return telegrams
 
-    def _overdue(self, now_ns: int) -> Iterable[Telegram]:
-        telegrams = self._replies.abandon_partial()
-        late = sum(each.command == VALUES for each in telegrams)
-        if late:
-            self._counters.drop("late_scan", late)
-        return telegrams
-
     def _take(self, telegram: Telegram, stamp_ns: int) -> Iterator[Reading]:
         if telegram.command in (ACK, NAK):
             return

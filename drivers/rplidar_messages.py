@@ -251,16 +251,19 @@ class _NodeStream:
         if last < at:
             return at
         here = np.frombuffer(data, np.uint8, len(data) - at, at)
-        checks = _checks(here[:-2], np.asarray(here[1:-1] | here[2:].astype(np.uint16) << 8, dtype=np.uint16))
-        runs = checks[: last - at + 1].copy()
+        angle = np.asarray(here[1:-1] | here[2:].astype(np.uint16) << 8, dtype=np.uint16)
+        size = last - at + 1
+        step = (_radians(angle[5:]) - _radians(angle[:-5]) + math.pi) % _TURN - math.pi
+        follows = (step >= self.BACK_RAD) & (step <= self.AHEAD_RAD)
+        checks = _checks(here[:-2], angle)
+        runs = checks[:size].copy()
         for node in range(1, self.RUN):
-            runs &= checks[5 * node : 5 * node + runs.size]
-        for begin in np.flatnonzero(runs).tolist():
-            angle = _node_angles(np.frombuffer(data, _NODE, self.RUN, at + begin))
-            if self._follow(angle).all():
-                self._in_step = True
-                self._last_rad = float(angle[0])
-                return at + int(begin)
+            runs &= checks[5 * node : 5 * node + size] & follows[5 * (node - 1) : 5 * (node - 1) + size]
+        if runs.any():
+            begin = int(np.argmax(runs))
+            self._in_step = True
+            self._last_rad = float(_radians(angle[begin : begin + 1])[0])
+            return at + begin
         return last + 1
 
     def _follow(self, angle_rad: F64) -> NDArray[np.bool_]:
@@ -269,7 +272,11 @@ class _NodeStream:
 
 
 def _node_angles(nodes: NDArray[np.void]) -> F64:
-    return np.asarray((nodes["angle"] >> 1) * (math.pi / 180.0 / 64.0), dtype=np.float64)
+    return _radians(nodes["angle"])
+
+
+def _radians(angle: NDArray[np.uint16]) -> F64:
+    return np.asarray((angle >> 1) * (math.pi / 180.0 / 64.0), dtype=np.float64)
 
 
 def _node_checks(nodes: NDArray[np.void]) -> NDArray[np.bool_]:
@@ -362,7 +369,8 @@ class _CapsuleStream:
     def _tell(self, capsule: Capsule, stamp_ns: int, bytes_after: int, next_rad: float, found: list[Block]) -> None:
         span_rad = (next_rad - capsule.start_rad) % _TURN
         stray_rad, self._stray_rad = self._stray_rad, None
-        if not (_like(span_rad, self._span_rad) or (stray_rad is not None and _like(span_rad, stray_rad))):
+        trusted = capsule.is_first if self._span_rad is None else _like(span_rad, self._span_rad)
+        if not (trusted or (stray_rad is not None and _like(span_rad, stray_rad))):
             self._counters.drop("stray_angle")
             self._stray_rad = span_rad
             self._gap = True
@@ -376,9 +384,9 @@ class _CapsuleStream:
         self._gap = False
 
 
-def _like(span_rad: float, usual_rad: float | None) -> bool:
+def _like(span_rad: float, usual_rad: float) -> bool:
     """The head's speed changes by less than this from one capsule to the next; a lost capsule doubles the span."""
-    return usual_rad is None or usual_rad / 1.6 <= span_rad <= usual_rad * 1.6
+    return usual_rad / 1.6 <= span_rad <= usual_rad * 1.6
 
 
 def _find_header(data: bytes, at: int) -> int:

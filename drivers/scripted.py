@@ -23,7 +23,6 @@ FIRST_READING_NS = 4_000 * _MS  # a motor takes seconds to spin up
 SILENCE_CAP_NS = 500 * _MS
 RESTART_NS = 450 * _MS  # without a reading for this long the device is asked what is the matter
 GARBLED_NS = 2_000 * _MS  # so long when bytes do come, but nothing is whole
-PARTIAL_NS = 100 * _MS  # no device pauses for so long within a message
 STALL_NS = 150 * _MS  # we ourselves were not called for so long: what came meanwhile must be read first
 
 MessageT = TypeVar("MessageT")
@@ -60,7 +59,6 @@ class ScriptedConversation(ABC, Generic[MessageT]):
         self._deadline_ns = now_ns
         self._asked_ns = now_ns  # newest call of requests()
         self._received_ns = now_ns
-        self._looked_overdue = False  # since bytes last came
         self._read_ns = now_ns  # newest reading
         self._period_ns: float | None = None  # between two readings, while they are expected
         self._standing_trouble: str | None = None  # what is wrong although readings come
@@ -74,10 +72,6 @@ class ScriptedConversation(ABC, Generic[MessageT]):
     @abstractmethod
     def _take(self, message: MessageT, stamp_ns: int) -> Iterable[Reading]:
         """Readings that a message completes."""
-
-    def _overdue(self, now_ns: int) -> Iterable[MessageT]:
-        """Messages held up by the begin of one that never ended; asked for once, PARTIAL_NS after the last byte."""
-        return ()
 
     @abstractmethod
     def _life(self) -> Generator[Step[MessageT], MessageT | None, None]:
@@ -136,7 +130,6 @@ class ScriptedConversation(ABC, Generic[MessageT]):
         self._counters.chunks += 1
         self._counters.bytes += len(chunk)
         self._received_ns = stamp_ns
-        self._looked_overdue = False
         for message in self._messages(chunk, stamp_ns):
             for reading in self._take(message, stamp_ns):
                 self._note_reading(stamp_ns)
@@ -148,10 +141,6 @@ class ScriptedConversation(ABC, Generic[MessageT]):
         if self._script is None:
             return []
         self._notice_silence(now_ns)
-        if not self._looked_overdue and now_ns - self._received_ns > PARTIAL_NS:
-            self._looked_overdue = True
-            for message in self._overdue(now_ns):
-                self._advance(message, now_ns)
         out: list[bytes | SetBaudRate] = []
         while not self._step_sent or now_ns >= self._deadline_ns:
             if not self._step_sent:

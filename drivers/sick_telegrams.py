@@ -79,25 +79,20 @@ class Telegram:
 
 
 class TelegramReader:
-    """Whole telegrams from chunks. What does not fit is looked at again from its second byte."""
+    """Whole telegrams from chunks. What does not fit is looked at again from its second byte.
+
+    A telegram that has begun does not hold up a whole one behind its begin: then it was none, or was cut.
+    """
 
     def __init__(self, counters: SourceCounters | None = None) -> None:
         self._counters = counters or SourceCounters()
         self._buffer = bytearray()
         self._began_ns = 0  # of the buffer's first byte
+        _crc_shares()  # made once, not when the first telegram comes
 
     def clear(self) -> None:
         """Forget a telegram that has only begun."""
         self._buffer.clear()
-
-    def abandon_partial(self) -> list[Telegram]:
-        """What has begun will not be completed: the telegrams that were held up behind it."""
-        found: list[Telegram] = []
-        while self._buffer and not found:
-            self._counters.drop("noise_bytes")
-            del self._buffer[0]
-            found = self.feed(b"", self._began_ns)
-        return found
 
     def feed(self, chunk: bytes, stamp_ns: int) -> list[Telegram]:
         """Telegrams that this chunk completes, ACKs and NAKs, in order."""
@@ -109,7 +104,12 @@ class TelegramReader:
         while at < len(data):
             size = _size_at(data, at)
             if size is None or at + size > len(data):
-                break
+                whole = _whole_behind(data, at)
+                if whole is None:
+                    break
+                noise += whole - at
+                at = whole
+                continue
             began_ns = self._began_ns if at < old else stamp_ns
             after = len(data) - at - size
             if size == 1 and data[at] in (ACK, NAK):
@@ -155,6 +155,15 @@ def _size_at(data: bytes, at: int) -> int | None:
         if length - 2 * values not in (4, 6):  # 6: with real-time indices
             return 1
     return length + 6
+
+
+def _whole_behind(data: bytes, at: int) -> int | None:
+    """Where a whole telegram begins behind this place, if there is one."""
+    while (at := data.find(STX, at + 1)) >= 0:
+        size = _size_at(data, at)
+        if size is not None and 1 < size <= len(data) - at and crc16_fast(data[at : at + size]) == 0:
+            return at
+    return None
 
 
 @cache

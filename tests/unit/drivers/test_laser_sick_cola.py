@@ -163,7 +163,8 @@ class TestRecorded:
         assert len(telegrams) == 301
         for number, each in enumerate(telegrams):
             frame = data[number * 3374 : (number + 1) * 3374]
-            scan = decode_scan(each.payload)
+            scan = each.scan
+            assert scan is not None
             at = frame.index(b"DIST1") + 21
             assert scan.channels["DIST1"].raw.tolist() == list(struct.unpack_from(">811H", frame, at))
             at = frame.index(b"RSSI1") + 21
@@ -415,7 +416,7 @@ def test_damage_that_the_sum_does_not_find() -> None:
     assert len(d.readings) == before
     d.run(0.5)
     assert len(d.readings) > before + 5
-    assert d.conversation.counters.drops == {}
+    assert set(d.conversation.counters.drops) == {"noise_bytes"}  # their bytes were looked through for a telegram
 
 
 def test_another_unit_is_believed_at_last() -> None:
