@@ -27,9 +27,10 @@ from drivers.logs import LogError, PoseKind, read_log
 from sim_devices.attach import Attachment
 from sim_devices.faults import KINDS, FaultPlan, FaultSyntaxError
 from sim_devices.floor_plan import WorldError, load_floor_plan, world_names
-from sim_devices.laser_hokuyo import PROFILES, LaserProfile
+from sim_devices.laser_hokuyo import LaserProfile
+from sim_devices.lasers import MODELS
 from sim_devices.log_scene import LogScene, Pace, laser_profile
-from sim_devices.presets import PRESETS, PresetError, Robot, Table, emulate, for_log, preset, to_toml
+from sim_devices.presets import PRESETS, PresetError, Robot, Table, emulate, for_log, hurry, preset, to_toml
 from sim_devices.robot import CommandedMotion, Motion, SimScene, WheelErrors, follow
 from sim_devices.world import World
 
@@ -69,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--log", type=Path, help="play this recorded log instead of a world")
     add("--poses", choices=[k.value for k in PoseKind], help="what the log's poses are; default: found out")
     add("--speed", type=_positive, default=1.0, help="times real time, of the robot and the world or log")
-    add("--laser", choices=sorted(PROFILES), default="utm-30lx", help="model of the lasers (not with --log)")
+    add("--laser", choices=list(MODELS), help="model of the lasers; default: the first of the configured driver")
     add("--fault", action="append", default=[], metavar="SPEC", help=f"what goes wrong; kinds: {', '.join(KINDS)}")
     add("--seed", type=int, default=0, help="of noise, faults, slip and people")
     add("--slip", type=_not_negative, default=DEFAULT_SLIP_M, help="random wheel slip, m after one metre")
@@ -112,6 +113,7 @@ def _run(options: argparse.Namespace) -> int:
             stage.scene,
             attachment,
             folder,
+            laser=options.laser,
             profile=stage.profile,
             exact=stage.exact,
             seed=options.seed,
@@ -183,7 +185,7 @@ class Stage:
     name: str
     scene: AnyScene
     config: Table
-    profile: LaserProfile
+    profile: LaserProfile | None = None
     exact: bool = False
     commands: CommandedMotion | None = None
     lap_s: float | None = None  # of a route that ends
@@ -227,11 +229,9 @@ def _world_stage(options: argparse.Namespace, config: Table, now_ns: int) -> Sta
         speed=options.speed,
     )
     if options.speed > 1.0 and plan.route is not None:
-        config.setdefault("drive", {})["max_wheel_speed_m_s"] = 5.0 * options.speed
-        for wheels in config.get("wheels", {}).values():
-            wheels["max_turns_per_s"] = 20.0 * options.speed
+        hurry(config, options.speed)
     name = plan.name or Path(options.world).stem
-    return Stage(name, scene, config, PROFILES[options.laser], commands=commands, lap_s=lap_s)
+    return Stage(name, scene, config, commands=commands, lap_s=lap_s)
 
 
 def _log_stage(options: argparse.Namespace, config: Table, now_ns: int) -> Stage:

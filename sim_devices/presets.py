@@ -14,25 +14,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sim_devices.attach import Attachment, PtyLink
+from sim_devices.attach import Attachment, PtyLink, TcpLink
 from sim_devices.device import ByteDevice, CanDevice, Mount, Scene
-from sim_devices.encoder_arduino_bridge import ArduinoBridge
+from sim_devices.encoder_arduino_bridge import ArduinoBridge, Sonar
 from sim_devices.encoder_cia406 import Cia406Encoder
 from sim_devices.encoder_odrive import ODriveAxis
 from sim_devices.encoder_roboclaw import RoboClaw
 from sim_devices.encoder_vesc import STEPS_PER_ELECTRICAL_TURN, Vesc
 from sim_devices.faults import FaultPlan
-from sim_devices.laser_hokuyo import PROFILES, UTM_30LX, HokuyoLaser, LaserProfile
+from sim_devices.laser_hokuyo import LaserProfile
+from sim_devices.lasers import FIRST_MODEL, MODELS, make_laser
 from sim_devices.slcan_hub import CanBus, CanBusStation
-from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardCan, default_parameters
+from sim_devices.sonar_maxbotix import FAMILIES, MaxBotix, TextMultiplexer
+from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardCan, UsBoardSerial, default_parameters
 from sim_devices.wheel import Side, Wheel
 
 Table = dict[str, Any]
 
 SIDES: tuple[Side, Side] = ("left", "right")
-WHEEL_BOARDS = frozenset({"arduino-bridge", "roboclaw"})  # one board on a serial line counts both wheels
+BRIDGE = "arduino-bridge"
 FIRST_NODE = {"cia406": 0x20, "odrive": 0, "vesc": 1}  # one node a wheel on a CAN bus
-WHEEL_DRIVERS = WHEEL_BOARDS | FIRST_NODE.keys()
+WHEEL_DRIVERS = (BRIDGE, "roboclaw", *FIRST_NODE)
+SONAR_DRIVERS = ("usboard", "usboard-serial", "maxbotix", BRIDGE)
+TICK_LIMITED = (BRIDGE, "roboclaw", "vesc")  # their limit of speed is max_ticks_per_s, others' max_turns_per_s
 
 HOST = "host"  # the daemon's adapter on every bus
 INLINE_TABLES = frozenset({"mount", "pose", "tls"})
@@ -46,14 +50,15 @@ class PresetError(ValueError):
 class Robot:
     """An emulated robot on its wires.
 
-    config: the daemon's configuration for it.  links: every pty, under its station's name ("lasers.front", "can.main").
+    config: the daemon's configuration for it.  links: every pty or TCP port, under its station's name ("lasers.front",
+    "can.main").
     buses, lasers, sonars, encoders: by their names in the configuration (encoders as "drive.left").
     """
 
     config: Table
-    links: dict[str, PtyLink] = field(default_factory=dict)
+    links: dict[str, PtyLink | TcpLink] = field(default_factory=dict)
     buses: dict[str, CanBusStation] = field(default_factory=dict)
-    lasers: dict[str, HokuyoLaser] = field(default_factory=dict)
+    lasers: dict[str, ByteDevice] = field(default_factory=dict)
     sonars: dict[str, UsBoard] = field(default_factory=dict)
     encoders: dict[str, Cia406Encoder] = field(default_factory=dict)
 
@@ -68,27 +73,31 @@ def emulate(
     attachment: Attachment,
     folder: Path,
     *,
-    profile: LaserProfile = UTM_30LX,
+    laser: str | None = None,
+    profile: LaserProfile | None = None,
     exact: bool = False,
     seed: int = 0,
     plan: FaultPlan | None = None,
 ) -> Robot:
     """Attach an emulated device for each device of a configuration, and say where.
 
-    folder: where the ptys' links stand.  profile: model of the lasers.  exact: no noise on lasers (recorded ranges have
-    theirs).  plan: faults; its targets are laser.NAME, sonar.NAME, encoder.left and .right, bus.NAME, and adapter.NAME,
-    the daemon's port on that bus.  Raises PresetError for a device that cannot be emulated.
+    folder: where the ptys' links stand.  laser: model of all lasers, whatever the configuration says; default: the
+    first of each laser's driver.  profile: of a Hokuyo that is no model.  exact: no noise on lasers (recorded ranges
+    have theirs).  plan: faults; its targets are laser.NAME, sonar.NAME, encoder.left and .right, bus.NAME, and
+    adapter.NAME, the daemon's port on that bus.  Raises PresetError for a device that cannot be emulated.
     """
     robot = Robot(copy.deepcopy(dict(config)))
     builder = _Builder(robot, scene, attachment, folder, plan or FaultPlan(seed=seed), faulty=plan is not None)
     for name, bus in robot.config.get("can", {}).items():
         builder.add_bus(name, bus)
-    for k, (name, laser) in enumerate(sorted(robot.config.get("lasers", {}).items())):
-        builder.add_laser(name, laser, profile, exact=exact, seed=seed + k, number=k)
+    for k, (name, table) in enumerate(sorted(robot.config.get("lasers", {}).items())):
+        builder.add_laser(name, table, laser, profile, exact=exact, seed=seed + k, number=k)
     for k, (name, sonar) in enumerate(sorted(robot.config.get("sonars", {}).items())):
         builder.add_sonar(name, sonar, seed=seed + 100 + k)
     for name, wheels in robot.config.get("wheels", {}).items():
         builder.add_wheels(name, wheels)
+    for port in builder.bridge_ports():
+        builder.add_bridge(port)
     return robot
 
 
@@ -115,41 +124,125 @@ class _Builder:
         self.robot.buses[name], self.robot.links[f"can.{name}"] = station, link
         bus["interface"], bus["channel"] = "slcan", str(link.path)
 
-    def add_laser(self, name: str, laser: Table, profile: LaserProfile, *, exact: bool, seed: int, number: int) -> None:
-        _require(laser, f"lasers.{name}", "hokuyo")
+    def add_laser(
+        self,
+        name: str,
+        laser: Table,
+        model: str | None,
+        profile: LaserProfile | None,
+        *,
+        exact: bool,
+        seed: int,
+        number: int,
+    ) -> None:
+        driver = _required(laser, f"lasers.{name}", FIRST_MODEL)
+        model = model or FIRST_MODEL[driver]
+        if MODELS[model] != driver:  # another kind than configured: only where it sits stays as it was
+            mount = laser.get("mount", {})
+            laser.clear()
+            laser |= {"driver": MODELS[model], "mount": mount}
         target = f"laser.{name}"
-        device = HokuyoLaser(
+        on_tcp = MODELS[model] == "sick_cola" or str(laser.get("port", "")).startswith("tcp:")
+        device = make_laser(
+            model,
             self._seen(target),
             _mount(laser.get("mount", {})),
-            profile=profile,
-            serial=f"{profile.serial[:-1]}{number}" if number else None,
             seed=seed,
-            link="usb",
-            noise_scale=0.0 if exact else 1.0,
+            number=number,
+            exact=exact,
+            profile=profile,
+            on_tcp=on_tcp,
         )
-        link = PtyLink(self.folder / f"laser-{name}")
+        link = TcpLink(0) if on_tcp else PtyLink(self.folder / f"laser-{name}")
         self.attachment.add(f"lasers.{name}", self.plan.device(target, device) if self.faulty else device, link)
         self.robot.lasers[name], self.robot.links[f"lasers.{name}"] = device, link
-        laser["port"] = str(link.path)
+        laser["port"] = str(link.path) if isinstance(link, PtyLink) else f"tcp://{link.host}:{link.port}"
 
     def add_sonar(self, name: str, sonar: Table, *, seed: int) -> None:
-        place, target = f"sonars.{name}", f"sonar.{name}"
-        _require(sonar, place, "usboard")
-        half = math.radians(float(sonar.get("cone_deg", 30.0))) / 2.0
-        transducers = {int(t["channel"]): Transducer(_mount(t), half) for t in sonar.get("transducers", [])}
+        driver = _required(sonar, f"sonars.{name}", SONAR_DRIVERS)
+        if driver == BRIDGE:
+            return  # see add_bridge
+        target = f"sonar.{name}"
+        if driver == "maxbotix":
+            device = self._maxbotix(sonar, self._seen(target), f"sonars.{name}", seed)
+            self._attach_serial(f"sonars.{name}", f"sonar-{name}", [sonar], target, device)
+            return
+        half_angle_rad = _half_cone_rad(sonar)
+        transducers = {channel: Transducer(m, half_angle_rad) for channel, m in _transducer_mounts(sonar).items()}
         base_id = int(sonar.get("base_id", 0x400))
         parameters = default_parameters(base_id, serial=20000 + base_id)
-        board = UsBoard(self._seen(target), transducers, parameters=parameters, seed=seed)
-        self._join(_bus_of(self.robot, sonar, place), target, UsBoardCan(board))
-        self.robot.sonars[name] = board
+        board = self.robot.sonars[name] = UsBoard(self._seen(target), transducers, parameters=parameters, seed=seed)
+        if driver == "usboard":
+            self._join(_bus_of(self.robot, sonar, f"sonars.{name}"), target, UsBoardCan(board))
+        else:
+            self._attach_serial(f"sonars.{name}", f"sonar-{name}", [sonar], target, UsBoardSerial(board))
+
+    def _maxbotix(self, sonar: Table, scene: Scene, place: str, seed: int) -> MaxBotix | TextMultiplexer:
+        """One sensor or several behind a multiplexer; the rate in the configuration becomes what they can do."""
+        mounts = _transducer_mounts(sonar) or {1: Mount()}
+        family = str(sonar.get("family", "hr-5m"))
+        if family not in FAMILIES:
+            raise PresetError(f"{place}.family: no {family!r}; there are {', '.join(FAMILIES)}")
+        lines, half_angle_rad = str(sonar.get("lines", "single")), _half_cone_rad(sonar)
+        if lines == "single":
+            first = mounts[min(mounts)]
+            sonar["rate_hz"] = round(1e9 / FAMILIES[family].period_ns, 2)
+            return MaxBotix(scene, first, family=family, half_angle_rad=half_angle_rad, seed=seed)
+        baud_bps = int(sonar.get("baud_bps", 9600))
+        several = TextMultiplexer(
+            scene, mounts, family=family, half_angle_rad=half_angle_rad, baud_bps=baud_bps, lines=lines, seed=seed
+        )
+        sonar["rate_hz"] = round(several.rate_hz, 2)
+        return several
+
+    # -- boards with the sketch of ros_arduino_bridge: wheels and sonars that name the same port are one board ---------
+
+    def bridge_ports(self) -> list[str]:
+        """The ports of such boards, as the configuration names them."""
+        return list(dict.fromkeys(str(table.get("port")) for _, _, table in self._bridge_members()))
+
+    def add_bridge(self, port: str) -> None:
+        members = [member for member in self._bridge_members() if str(member[2].get("port")) == port]
+        tables = [table for _, _, table in members]
+        wheels = [name for section, name, _ in members if section == "wheels"]
+        sonars = [name for section, name, _ in members if section == "sonars"]
+        if len(wheels) > 1 or len(sonars) > 1:
+            raise PresetError(f"{port}: a board has one pair of wheels and one set of sonars")
+        pins = {
+            pin: Sonar(mount, _half_cone_rad(table), range_max_m=float(table.get("range_max_m", 3.0)))
+            for table in tables
+            for pin, mount in _transducer_mounts(table).items()
+        }
+        target = self._wheels_target(wheels[0]) if wheels else f"sonar.{sonars[0]}"
+        pair = self._wheel_pair(self._seen(target)) if wheels else (None, None)
+        board = ArduinoBridge(*pair, sonars=pins, baud_bps=int(tables[0].get("baud_bps", 57600)))
+        if sonars:
+            board.see(self._seen(f"sonar.{sonars[0]}"))
+        place = f"wheels.{wheels[0]}" if wheels else f"sonars.{sonars[0]}"
+        self._attach_serial(place, place.replace(".", "-"), tables, target, board)
+
+    def _bridge_members(self) -> list[tuple[str, str, Table]]:
+        """Section, name and table of everything on such boards."""
+        return [
+            (section, name, table)
+            for section in ("wheels", "sonars")
+            for name, table in self.robot.config.get(section, {}).items()
+            if table.get("driver") == BRIDGE
+        ]
+
+    # -- wheels -------------------------------------------------------------------------------------------------------
 
     def add_wheels(self, name: str, wheels: Table) -> None:
         driver = _required(wheels, f"wheels.{name}", WHEEL_DRIVERS)
-        alone = len(self.robot.config["wheels"]) == 1
-        target = "encoder" if alone else f"encoder.{name}"
-        if driver in WHEEL_BOARDS:
-            board = self._wheel_board(driver, wheels, target)
-            self._attach_serial(f"wheels.{name}", wheels, target, board)
+        target = self._wheels_target(name)
+        if driver == BRIDGE:
+            return  # see add_bridge
+        if driver == "roboclaw":
+            first, second = self._wheel_pair(self._seen(target))
+            if int(wheels.get("left_motor", 1)) == 2:
+                first, second = second, first
+            board = RoboClaw(first, second, address=int(wheels.get("address", 0x80)))
+            self._attach_serial(f"wheels.{name}", f"wheels-{name}", [wheels], target, board)
             return
         bus = _bus_of(self.robot, wheels, f"wheels.{name}")
         for number, side in enumerate(SIDES):
@@ -158,20 +251,21 @@ class _Builder:
             if isinstance(node, Cia406Encoder):
                 self.robot.encoders[f"{name}.{side}"] = node
 
-    def _wheel_board(self, driver: str, wheels: Table, target: str) -> ArduinoBridge | RoboClaw:
-        left, right = (self._wheel(side, self._seen(target)) for side in SIDES)
-        if driver == "roboclaw":
-            return RoboClaw(left, right, address=int(wheels.get("address", 0x80)))
-        return ArduinoBridge(left, right, baud_bps=int(wheels.get("baud_bps", 57600)))
+    def _wheels_target(self, name: str) -> str:
+        return "encoder" if len(self.robot.config["wheels"]) == 1 else f"encoder.{name}"
+
+    def _wheel_pair(self, scene: Scene) -> tuple[Wheel, Wheel]:
+        return self._wheel("left", scene), self._wheel("right", scene)
 
     def _wheel_node(self, driver: str, wheels: Table, number: int, target: str) -> CanDevice:
         side = SIDES[number]
         wheel = self._wheel(side, self._seen(target))
         ticks, sign = abs(wheel.ticks_per_turn), 1 if wheel.ticks_per_turn > 0 else -1
-        node = int(wheels.get(f"node_{side}", FIRST_NODE[driver] + number))
+        key = "id" if driver == "vesc" else "node"
+        node = int(wheels.get(f"{key}_{side}", FIRST_NODE[driver] + number))
         if driver == "odrive":
-            cpr = int(wheels.get("cpr", 8192))
-            generation = "0.5" if str(wheels.get("firmware", "0.6")).startswith("0.5") else "0.6"
+            cpr = int(wheels.get("counts_per_turn", 8192))
+            generation = "0.5" if wheels.get("firmware") == "0.5" else "0.6"
             return ODriveAxis(wheel, node, generation=generation, gear=ticks / cpr, sign=sign, cpr=cpr)
         if driver == "vesc":  # a tick is a step of the tachometer
             return Vesc(wheel, node, pole_pairs=1, gear=ticks / STEPS_PER_ELECTRICAL_TURN, sign=sign)
@@ -192,12 +286,13 @@ class _Builder:
         radius_m = float(drive.get(f"wheel_radius_{side}_m", 0.10))
         return Wheel(scene, side, radius_m, float(drive.get(f"ticks_per_turn_{side}", 4096.0)))
 
-    def _attach_serial(self, station: str, table: Table, target: str, device: ByteDevice) -> None:
+    def _attach_serial(self, station: str, file: str, tables: list[Table], target: str, device: ByteDevice) -> None:
         """Put a device on a pty of its own and its name into the configuration."""
-        link = PtyLink(self.folder / station.replace(".", "-"))
+        link = PtyLink(self.folder / file)
         self.attachment.add(station, self.plan.device(target, device) if self.faulty else device, link)
         self.robot.links[station] = link
-        table["port"] = str(link.path)
+        for table in tables:
+            table["port"] = str(link.path)
 
     def _seen(self, target: str) -> Scene:
         return self.plan.scene(target, self.scene) if self.faulty else self.scene
@@ -220,9 +315,12 @@ def _required(device: Table, place: str, drivers: Collection[str]) -> str:
     return str(driver)
 
 
-def _require(device: Table, place: str, driver: str) -> None:
-    if device.get("driver") != driver:
-        raise PresetError(f"{place}.driver: only {driver!r} can be emulated here, not {device.get('driver')!r}")
+def _half_cone_rad(sonar: Table) -> float:
+    return math.radians(float(sonar.get("cone_deg", 30.0))) / 2.0
+
+
+def _transducer_mounts(sonar: Table) -> dict[int, Mount]:
+    return {int(t["channel"]): _mount(t) for t in sonar.get("transducers", [])}
 
 
 def _mount(table: Mapping[str, Any]) -> Mount:
@@ -302,8 +400,73 @@ def _transducer(channel: int, yaw_deg: float, *, half_length_m: float = 0.44, ha
     return {"channel": channel, "x_m": round(reach * c, 3), "y_m": round(reach * s, 3), "z_m": 0.30, "yaw_deg": yaw_deg}
 
 
-PRESETS: dict[str, Callable[[], Table]] = {"artos": artos}
-LASERS = tuple(PROFILES)
+def two_wheeler() -> Table:
+    """A small robot off the shelf: an LD06 on top, an Arduino that counts, drives and pings, all on USB."""
+    port = "/dev/ttyUSB0"
+    pings = [_transducer(pin, yaw, half_length_m=0.15, half_width_m=0.11) for pin, yaw in ((7, 30.0), (8, -30.0))]
+    sonars = {"driver": BRIDGE, "port": port, "cone_deg": 30.0, "range_max_m": 3.0, "transducers": pings}
+    laser = {"driver": "ldrobot", "port": "/dev/ttyUSB1", "mount": {"x_m": 0.0, "y_m": 0.0, "z_m": 0.18}}
+    table = _small("two_wheeler", laser, {"driver": BRIDGE, "port": port}, ticks_per_turn=1320.0)
+    table["sonars"] = {"front": sonars}
+    table["sectors"]["rect"]["around"]["sources"].append("sonars.front")
+    return table
+
+
+def roboclaw() -> Table:
+    """A robot with an RPLIDAR and a RoboClaw."""
+    laser = {"driver": "rplidar", "port": "/dev/ttyUSB0", "mount": {"x_m": 0.05, "y_m": 0.0, "z_m": 0.20}}
+    wheels = {"driver": "roboclaw", "port": "/dev/ttyACM0", "address": 0x80}
+    return _small("roboclaw", laser, wheels, ticks_per_turn=2797.0)
+
+
+def odrive() -> Table:
+    """A robot with hub motors on an ODrive, and a Hokuyo."""
+    laser = {"driver": "hokuyo", "port": "/dev/ttyACM0", "mount": {"x_m": 0.12, "y_m": 0.0, "z_m": 0.20}}
+    wheels = {"driver": "odrive", "can": "main", "node_left": 0, "node_right": 1, "counts_per_turn": 8192}
+    table = _small("odrive", laser, wheels, ticks_per_turn=8192.0)
+    table["can"] = {"main": {"interface": "socketcan", "channel": "can0", "bitrate_bps": 250000}}
+    return table
+
+
+def _small(name: str, laser: Table, wheels: Table, *, ticks_per_turn: float) -> Table:
+    """What the small robots share: the body, one laser that sees all round, the usual maps."""
+    return {
+        "robot": {"id": name, "footprint_m": [[0.16, 0.12], [-0.16, 0.12], [-0.16, -0.12], [0.16, -0.12]]},
+        "drive": {
+            "kind": "differential",
+            "source": "drive",
+            "wheel_radius_left_m": 0.0325,
+            "wheel_radius_right_m": 0.0325,
+            "track_width_m": 0.20,
+            "ticks_per_turn_left": ticks_per_turn,
+            "ticks_per_turn_right": ticks_per_turn,
+        },
+        "lasers": {"front": laser},
+        "wheels": {"drive": wheels},
+        "sectors": {
+            "polar": {
+                "laser": {"sources": ["lasers.front"], "sector_deg": 5.0, "start_deg": -180.0, "stop_deg": 180.0}
+            },
+            "rect": {"around": {"sources": ["lasers.front"], "size_m": [4.0, 4.0], "sector_m": 0.25}},
+        },
+        "grid": {"resolution_m": 0.05, "model": "counters"},
+    }
+
+
+def hurry(config: Table, speed: float) -> None:
+    """Let the daemon believe wheels that turn so many times faster than in real time."""
+    config.setdefault("drive", {})["max_wheel_speed_m_s"] = 5.0 * speed
+    for wheels in config.get("wheels", {}).values():
+        limit, value = ("max_ticks_per_s", 2e5) if wheels.get("driver") in TICK_LIMITED else ("max_turns_per_s", 20.0)
+        wheels[limit] = max(float(wheels.get(limit, 0.0)), value) * speed
+
+
+PRESETS: dict[str, Callable[[], Table]] = {
+    "artos": artos,
+    "two_wheeler": two_wheeler,
+    "roboclaw": roboclaw,
+    "odrive": odrive,
+}
 
 
 def preset(name: str) -> Table:

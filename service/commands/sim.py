@@ -26,7 +26,8 @@ def sim(
     ] = None,
     speed: Annotated[float | None, typer.Option(help="Times real time, of robot and world or log.")] = None,
     laser: Annotated[
-        str | None, typer.Option(help="Model of the lasers: utm-30lx (the default), urg-04lx, uhg-08lx, ust-10lx.")
+        str | None,
+        typer.Option(help="Model of the lasers: utm-30lx (default), lms200, rplidar-a1, ld06, tim571, ..."),
     ] = None,
     fault: Annotated[
         list[str] | None, typer.Option(help="What goes wrong, for example laser:unplug@20s+2s; may be repeated.")

@@ -13,10 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.config import load
-from sim_devices.attach import Attachment
+from sim_devices.attach import Attachment, TcpLink
 from sim_devices.device import Mount
 from sim_devices.faults import FaultPlan
 from sim_devices.floor_plan import FloorPlan, load_floor_plan
+from sim_devices.lasers import MODELS
 from sim_devices.presets import PRESETS, PresetError, emulate, for_log, preset, to_toml
 from sim_devices.robot import SimScene, Trajectory, follow
 from sim_devices.world import World
@@ -66,9 +67,11 @@ def test_the_daemon_accepts_what_a_preset_prints(name: str, tmp_path: Path) -> N
         for bus in loaded.can.values():
             assert bus.interface == "slcan"
             assert Path(bus.channel).is_symlink()
-        assert len(loaded.sectors.polar) == 3
-        assert len(loaded.sectors.rect) == 1
-        assert sum(len(s.transducers) for s in loaded.sonars.values()) == 16
+        for wheels in loaded.wheels.values():
+            assert wheels.serial_port() is None or Path(wheels.serial_port() or "").is_symlink()
+        polar, rect, transducers = {"artos": (3, 1, 16), "two_wheeler": (1, 1, 2)}.get(name, (1, 1, 0))
+        assert (len(loaded.sectors.polar), len(loaded.sectors.rect)) == (polar, rect)
+        assert sum(len(s.transducers) for s in loaded.sonars.values()) == transducers
     finally:
         attachment.stop()
 
@@ -207,3 +210,35 @@ def test_all_rooms_of_the_flat_are_seen_on_one_lap() -> None:
     for room, (x0, x1, y0, y1) in far_walls.items():
         inside = (points[:, 0] > x0) & (points[:, 0] < x1) & (points[:, 1] > y0) & (points[:, 1] < y1)
         assert inside.sum() > 20, room
+
+
+@pytest.mark.parametrize("model", sorted(MODELS))
+def test_every_laser_model_stands_on_its_wire_and_is_told_to_the_daemon(model: str, tmp_path: Path) -> None:
+    attachment = Attachment()
+    try:
+        robot = emulate(preset("artos"), motionless(), attachment, tmp_path, laser=model, exact=True, plan=FaultPlan())
+        laser = robot.config["lasers"]["front"]
+        link = robot.links["lasers.front"]
+        assert laser["driver"] == MODELS[model]
+        assert laser["mount"] == preset("artos")["lasers"]["front"]["mount"]
+        if isinstance(link, TcpLink):
+            assert laser["port"] == f"tcp://127.0.0.1:{link.port}"
+        else:
+            assert Path(laser["port"]).is_symlink()
+        if MODELS[model] != "hokuyo":
+            assert set(laser) == {"driver", "mount", "port"}
+        assert attachment.service(0) is not None
+    finally:
+        attachment.stop()
+
+
+def test_configured_driver_chooses_the_model(tmp_path: Path) -> None:
+    config = preset("artos")
+    config["lasers"] = {"low": {"driver": "ldrobot"}, "high": {"driver": "hokuyo", "port": "tcp://192.168.0.10:10940"}}
+    attachment = Attachment()
+    try:
+        robot = emulate(config, motionless(), attachment, tmp_path)
+        assert type(robot.lasers["low"]).__name__ == "LdLidar"
+        assert robot.config["lasers"]["high"]["port"].startswith("tcp://127.0.0.1:")
+    finally:
+        attachment.stop()
