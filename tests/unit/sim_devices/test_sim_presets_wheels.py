@@ -11,7 +11,7 @@ import serial
 
 from sim_devices.attach import Attachment, MemoryLink
 from sim_devices.faults import FaultPlan
-from sim_devices.floor_plan import FloorPlan
+from sim_devices.floor_plan import FloorPlan, Wall
 from sim_devices.presets import PresetError, Robot, emulate
 from sim_devices.robot import CommandedMotion, SimScene, Trajectory, twist
 from sim_devices.world import World
@@ -55,7 +55,10 @@ def ask(attachment: Attachment, port: serial.Serial, command: bytes, at_ns: int)
     port.write(command)
     for later_ns in range(0, 60 * MS, MS):
         attachment.service(at_ns + later_ns)
-    return bytes(port.read(4096))
+    answer = b""
+    while chunk := port.read(4096):  # a pty hands bytes on in its own time
+        answer += chunk
+    return answer
 
 
 @pytest.mark.parametrize(("fault", "left"), [("", 1.0), ("encoder:missed_counts=0.5(side=1)", 0.5)])
@@ -63,7 +66,7 @@ def test_arduino_board_on_a_pty(tmp_path: Path, fault: str, left: float) -> None
     attachment, robot = stage(tmp_path, *([fault] if fault else []), driver="arduino-bridge")
     try:
         attachment.service(0)
-        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=0) as port:
+        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=0.1) as port:
             assert ask(attachment, port, b"b\r", 2 * SECOND) == b"57600\r\n"
             counts = ask(attachment, port, b"e\r", 10 * SECOND).split()
             assert int(counts[0]) == pytest.approx(left * TICKS, abs=2)
@@ -76,7 +79,7 @@ def test_roboclaw_on_a_pty(tmp_path: Path) -> None:
     attachment, robot = stage(tmp_path, driver="roboclaw", address=0x81)
     try:
         attachment.service(0)
-        with serial.Serial(robot.config["wheels"]["drive"]["port"], 115200, timeout=0) as port:
+        with serial.Serial(robot.config["wheels"]["drive"]["port"], 115200, timeout=0.1) as port:
             counts = ask(attachment, port, b"\x81\x4e", 10 * SECOND)
             assert int.from_bytes(counts[:4], "big") == pytest.approx(TICKS, abs=2)
             assert int.from_bytes(counts[4:8], "big", signed=True) == pytest.approx(-TICKS, abs=2)
@@ -88,8 +91,8 @@ def test_roboclaw_on_a_pty(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("wheels", "ids"),
     [
-        ({"driver": "odrive", "node_left": 3, "node_right": 4, "firmware": "0.5.6"}, (0x06A, 0x08A)),
-        ({"driver": "vesc", "node_left": 10, "node_right": 11}, (0x1B0A, 0x1B0B)),
+        ({"driver": "odrive", "node_left": 3, "node_right": 4, "firmware": "0.5"}, (0x06A, 0x08A)),
+        ({"driver": "vesc", "id_left": 10, "id_right": 11}, (0x1B0A, 0x1B0B)),
     ],
 )
 def test_nodes_on_a_bus(tmp_path: Path, wheels: dict[str, Any], ids: tuple[int, int]) -> None:
@@ -129,12 +132,71 @@ def test_hosts_commands_drive_a_robot_without_a_route(tmp_path: Path) -> None:
     robot = emulate(table, scene, attachment, tmp_path, plan=FaultPlan(["encoder:slip=0.0"]))
     try:
         attachment.service(0)
-        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=0) as port:
+        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=0.1) as port:
             assert ask(attachment, port, b"m 20 20\r", 2 * SECOND) == b"OK\r\n"
             for at_ns in range(2 * SECOND, 5 * SECOND, 20 * MS):
                 attachment.service(at_ns)
             # 600 ticks a second for two seconds
             assert scene.pose_at([6 * SECOND])[0, 0] == pytest.approx(1200 / 2000 * 2 * math.pi * 0.1, abs=0.02)
+    finally:
+        attachment.stop()
+
+
+def sonar_lines(tmp_path: Path, **sonar: Any) -> tuple[list[bytes], dict[str, Any]]:
+    """What the sonar of a configuration says in three seconds, and its configuration afterwards."""
+    attachment = Attachment(clock=lambda: 0)
+    walls = FloorPlan(walls=(Wall(((2.05, -3.0), (2.05, 3.0))), Wall(((-3.0, 1.05), (3.0, 1.05)))))
+    scene = SimScene(World.from_plan(walls), CommandedMotion((0.0, 0.0, 0.0)))
+    robot = emulate({"robot": {"id": "two"}, "sonars": {"s": sonar}}, scene, attachment, tmp_path)
+    try:
+        with serial.Serial(robot.config["sonars"]["s"]["port"], 9600, timeout=0.1) as port:
+            said = b""
+            for at_ms in range(3000):
+                attachment.service(at_ms * MS)
+                if at_ms % 500 == 0:
+                    said += port.read(4096)
+            said += port.read(4096)
+    finally:
+        attachment.stop()
+    return [line for line in said.replace(b"\n", b"").split(b"\r") if line], robot.config["sonars"]["s"]
+
+
+def transducers(*channels: int) -> list[dict[str, float]]:
+    return [{"channel": c, "yaw_deg": 90.0 * k} for k, c in enumerate(channels)]
+
+
+def test_sonar_on_its_own_line(tmp_path: Path) -> None:
+    said, table = sonar_lines(tmp_path, driver="maxbotix", family="xl", transducers=transducers(1))
+    assert said[-2] in (b"R199", b"R200", b"R201")
+    assert table["rate_hz"] == pytest.approx(10.1)
+
+
+def test_sonars_behind_a_multiplexer(tmp_path: Path) -> None:
+    settings = {"driver": "maxbotix", "family": "xl"}
+    said, table = sonar_lines(tmp_path, **settings, lines="labelled", transducers=transducers(2, 5))
+    assert {line[:4] for line in said[:-1]} <= {b"2:R1", b"2:R2", b"5:R1", b"5:R0"}
+    assert table["rate_hz"] == pytest.approx(5.05)
+    said, _ = sonar_lines(tmp_path, **settings, lines="list", transducers=transducers(1, 2))
+    assert {len(line) for line in said[:-1]} == {9}
+    with pytest.raises(PresetError, match="channels 1 to 2"):
+        sonar_lines(tmp_path, **settings, lines="list", transducers=transducers(1, 4))
+
+
+def test_wheels_and_sonars_on_one_port_are_one_board(tmp_path: Path) -> None:
+    table = config(driver="arduino-bridge", port="/dev/ttyUSB7")
+    pings = {"driver": "arduino-bridge", "transducers": [{"channel": 7}]}
+    table["sonars"] = {"a": pings | {"port": "/dev/ttyUSB7"}, "b": pings | {"port": "/dev/ttyUSB8"}}
+    attachment = Attachment(clock=lambda: 0)
+    try:
+        robot = emulate(
+            table, straight(), attachment, tmp_path, plan=FaultPlan(["sonar.a:specular=1", "encoder:drop=0"])
+        )
+        ports = [robot.config["wheels"]["drive"], robot.config["sonars"]["a"], robot.config["sonars"]["b"]]
+        assert ports[0]["port"] == ports[1]["port"] != ports[2]["port"]
+        attachment.service(0)
+        with serial.Serial(ports[0]["port"], 57600, timeout=0.1) as port:
+            assert ask(attachment, port, b"e\r", 2 * SECOND).count(b" ") == 1
+            assert ask(attachment, port, b"p 7\r", 3 * SECOND) == b"0\r\n"
     finally:
         attachment.stop()
 
