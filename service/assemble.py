@@ -20,6 +20,7 @@ from drivers.readings import ChainReading, RangeReading, RangeStatus, Reading, S
 from mapping.frames import Pose2
 from mapping.odometry import DriveGeometry
 from service.config import (
+    SERIAL_NUMBER,
     SHARED_DRIVERS,
     ArduinoSonars,
     ArduinoWheels,
@@ -106,9 +107,11 @@ def _serial_wires(config: Config) -> Iterator[Wire]:
             yield Wire(source, None, partial(_open_tcp, *address), _talks(devices))
         elif port.startswith(_UDP):
             yield Wire(source, None, partial(_open_udp, port), _talks(devices))
+        elif port.startswith(SERIAL_NUMBER):
+            looked_for = _ByNumber(port, str(getattr(device, "driver", "")), config.search.ports)
+            yield Wire(source, None, partial(_open_found, looked_for, baud, _stops_by_dtr(device)), _talks(devices))
         else:
-            dtr_stops_motor = isinstance(device, RplidarLaser)
-            yield Wire(source, port, partial(_open_serial, port, baud, dtr_stops_motor), _talks(devices))
+            yield Wire(source, port, partial(_open_serial, port, baud, _stops_by_dtr(device)), _talks(devices))
 
 
 def _talks(devices: Mapping[str, Device]) -> Mapping[str, Callable[[], Conversation[Any]]]:
@@ -193,6 +196,28 @@ def _can_wires(config: Config) -> Iterator[Wire]:
 
 _UDP = ("udpin:", "udpout:")
 _FIRST_BAUD: dict[type[Device], int] = {UsBoardSerialSonars: 19200}
+
+
+def _stops_by_dtr(device: Device) -> bool:
+    return isinstance(device, RplidarLaser)
+
+
+@dataclass(frozen=True, slots=True)
+class _ByNumber:
+    """A device that is named by its serial number. port: with the prefix."""
+
+    port: str
+    driver: str
+    search: tuple[str, ...]
+
+
+def _open_found(wanted: _ByNumber, baud: int, dtr_stops_motor: bool, clock: Clock) -> Port[bytes]:
+    """Wherever the device is plugged in now."""
+    from service.detect import find_by_serial
+
+    number = wanted.port.removeprefix(SERIAL_NUMBER)
+    port = find_by_serial(number, driver=wanted.driver, search=wanted.search, now_ns=clock)
+    return _open_serial(port, baud, dtr_stops_motor, clock)
 
 
 def _open_serial(port: str, baud: int, dtr_stops_motor: bool, clock: Clock) -> Port[bytes]:

@@ -27,6 +27,8 @@ Positive = Annotated[float, Field(gt=0)]
 Point = tuple[float, float]
 SENSOR_SECTIONS = ("lasers", "sonars")
 DEVICE_SECTIONS = (*SENSOR_SECTIONS, "wheels")
+SERIAL_NUMBER = "serial:"
+"""What a port begins with that is a device's serial number: where it is plugged in is found out when it is opened."""
 SHARED_DRIVERS = ("arduino-bridge", "mavlink")
 """Of boards that are several sources: a table in each section may name the same port."""
 
@@ -139,7 +141,23 @@ class CanBus(Section):
 
 
 class Device(Section):
-    """What every device has: which wire it is on and what it claims there."""
+    """What every device has: which wire it is on and what it claims there.
+
+    `serial = "H0614967"` in a device's table stands for its port: it is then found by its serial number.
+    """
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_serial(cls, table: Any) -> Any:
+        if not isinstance(table, Mapping) or "serial" not in table or "port" not in cls.model_fields:
+            return table
+        serial = table["serial"]
+        if "port" in table:
+            raise ValueError("port and serial both say which device it is; keep one of them")
+        if not isinstance(serial, str) or not serial or any(letter.isspace() for letter in serial):
+            raise ValueError('serial must be the number as the device tells it, such as "H0614967"')
+        rest = {key: value for key, value in table.items() if key != "serial"}
+        return {**rest, "port": f"{SERIAL_NUMBER}{serial}"}
 
     def serial_port(self) -> str | None:
         """The serial port the device has for itself, or its address as tcp://HOST:PORT."""
@@ -174,7 +192,10 @@ def _good_port(port: str) -> str:
 
 
 PortName = Annotated[str, Field(min_length=1), AfterValidator(_good_port)]
-_PORT = "Serial port, best by a stable name (/dev/serial/by-id/...), or an address: tcp://192.168.0.10:10940."
+_PORT = (
+    "Serial port, best by a stable name (/dev/serial/by-id/...), an address (tcp://192.168.0.10:10940), or the "
+    "device's serial number (serial:H0614967, the same as serial = ...)."
+)
 _NO_ECHO = (
     "What a distance of 0 means. unknown: too far, or too near, too dark, glass; clear: nothing up to the farthest "
     "echo, which frees space and is right only where none of these is around."
@@ -733,6 +754,16 @@ class Store(Section):
     )
 
 
+class Search(Section):
+    """Where devices are looked for that are named by their serial number."""
+
+    ports: tuple[str, ...] = Field(
+        default=("/dev/serial/by-id/*", "/dev/serial/by-path/*", "/dev/ttyACM*", "/dev/ttyUSB*"),
+        min_length=1,
+        description="Patterns of port names.",
+    )
+
+
 class Mavlink(Section):
     """A polar sector map for an autopilot's obstacle avoidance: OBSTACLE_DISTANCE."""
 
@@ -812,6 +843,7 @@ class Config(Section):
     network: Network = Field(default=Network(), description="The Zenoh router.")
     ros: Ros = Field(default=Ros(), description="ROS 2 beside our own keys.")
     store: Store = Field(default=Store(), description="The map on disk.")
+    search: Search = Field(default=Search(), description="Where devices are looked for by serial number.")
     mavlink: Mavlink = Field(default=Mavlink(), description="A sector map for an autopilot.")
     recording: RecordingSettings = Field(
         default=RecordingSettings(), description="What happened, byte by byte, for `umfeld replay`."

@@ -1,0 +1,155 @@
+"""Devices that are told apart by who they are: two lasers of a kind plugged in the other way round, and `detect`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.readings import ScanReading
+from service import assemble, detect
+from service.config import check
+from service.config_files import Layers
+from sim_devices.attach import Attachment, PtyLink
+from sim_devices.device import Mount
+from sim_devices.encoder_arduino_bridge import ArduinoBridge
+from sim_devices.laser_hokuyo import HokuyoLaser
+from sim_devices.laser_ldrobot import LdLidar
+from sim_devices.laser_rplidar import RpLidar
+
+F64 = NDArray[np.float64]
+
+
+class Room:
+    """A round room: all a laser sees is how far its wall is, which tells whose scan it is."""
+
+    def __init__(self, radius_m: float) -> None:
+        self.radius_m = radius_m
+
+    def beam_ranges(self, mount: Mount, bearing_rad: F64, stamp_ns: F64, range_max_m: float) -> F64:
+        return np.full(len(bearing_rad), self.radius_m)
+
+    def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
+        return self.radius_m
+
+    def wheel_travel_m(self, now_ns: int) -> tuple[float, float]:
+        return 0.0, 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(name)
+
+
+def wait_for(what: str, ready: Callable[[], Any], seconds: float = 20.0) -> Any:
+    deadline = time.monotonic() + seconds
+    while not (result := ready()):
+        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
+        time.sleep(0.02)
+    return result
+
+
+def test_two_lasers_of_a_kind_keep_their_names_when_plugged_in_the_other_order(tmp_path: Path) -> None:
+    attachment = Attachment()
+    links = {name: PtyLink(tmp_path / f"ttyACM{number}") for number, name in enumerate(("H0000001", "H0000002"))}
+    for (number, link), radius_m in zip(links.items(), (1.0, 2.0)):
+        laser = HokuyoLaser(Room(radius_m), serial=number, spin_up_s=0.1, noise_scale=0.0)
+        attachment.add(number, laser, link)
+    attachment.start()
+    data = {
+        "lasers": {
+            "left": {"driver": "hokuyo", "serial": "H0000001"},
+            "right": {"driver": "hokuyo", "port": "serial:H0000002"},
+        },
+        "search": {"ports": [f"{tmp_path}/ttyACM*"]},
+    }
+    wires = assemble.wires(check(Layers(data, {}, {}, ())))
+    assert [wire.port for wire in wires] == [None, None]
+    heard: dict[str, list[float]] = {"left": [], "right": []}
+
+    def sink(source: str, item: object) -> None:
+        if isinstance(item, ScanReading):
+            heard[source].append(round(float(np.median(item.range_m)), 1))
+
+    readers = [wire.reader(sink, time.monotonic_ns) for wire in wires]
+    for reader in readers:
+        reader.start()
+    try:
+        wait_for("both lasers", lambda: all(len(scans) > 3 for scans in heard.values()))
+        for link in links.values():
+            link.close()
+        wait_for("the loss", lambda: not any(reader.health().is_open for reader in readers))
+        first, second = links.values()
+        first.path, second.path = second.path, first.path  # the other way round
+        before = {name: len(scans) for name, scans in heard.items()}
+        for link in (second, first):
+            link.open()
+        wait_for("both lasers again", lambda: all(len(heard[name]) > before[name] + 3 for name in heard))
+    finally:
+        for reader in readers:
+            reader.stop()
+        attachment.stop()
+    assert set(heard["left"]) == {1.0}
+    assert set(heard["right"]) == {2.0}
+
+
+def test_a_laser_that_is_not_there_is_told_by_its_number(tmp_path: Path) -> None:
+    data = {"lasers": {"left": {"driver": "hokuyo", "serial": "H7"}}, "search": {"ports": [f"{tmp_path}/*"]}}
+    (wire,) = assemble.wires(check(Layers(data, {}, {}, ())))
+    with pytest.raises(Exception, match=r"no device with serial number H7 .*plugged in"):
+        wire.open_port(time.monotonic_ns)
+
+
+def test_detect_names_what_is_on_each_port_in_time_and_side_by_side(tmp_path: Path) -> None:
+    attachment = Attachment()
+    room = Room(2.0)
+    devices = {
+        "hokuyo": HokuyoLaser(room, serial="H0614967"),
+        "rplidar": RpLidar(room),
+        "ldrobot": LdLidar(room),
+        "arduino-bridge": ArduinoBridge(None, None),
+    }
+    for name, device in devices.items():
+        attachment.add(name, device, PtyLink(tmp_path / name))  # type: ignore[arg-type]
+    silent = PtyLink(tmp_path / "silent")
+    attachment.start()
+    try:
+        began = time.monotonic()
+        ports = [(str(tmp_path / name), "") for name in (*devices, "silent", "absent")]
+        found = {Path(each.port).name: each for each in detect.detect(ports)}
+        took_s = time.monotonic() - began
+    finally:
+        attachment.stop()
+        silent.close()
+    assert {name: each.driver for name, each in found.items()} == {
+        **{name: name for name in devices},
+        "silent": "",
+        "absent": "",
+    }
+    assert "plugged in" in found["absent"].trouble
+    identity = found["hokuyo"].identity
+    assert identity is not None
+    assert identity.serial == "H0614967"
+    assert found["ldrobot"].speed_bps == 230400
+    assert took_s < 20.0
+
+
+def test_no_noise_is_taken_for_a_device() -> None:
+    random = np.random.default_rng(5)
+    texts = [b"", b"Invalid Command\r\n" * 3, b"hello 57600 world\r\n", b"$GPGGA,123519,4807.038,N*47\r\n" * 5, b"V\r"]
+    noise = [random.bytes(int(size)) for size in random.integers(1, 4000, 300)]
+    for data in [*texts, *noise, b"\xff" * 2000, b"\x00" * 2000, b"R" * 500, b"\x54\x2c" * 200, b"\xa5\x5a" * 100]:
+        for probe in detect.PROBES:
+            assert probe.recognise(data) is None, (probe.driver, data[:40])
+
+
+def test_questions_only_read() -> None:
+    """No probe says what sets a motor going, resets a count or writes a setting, in anybody's protocol."""
+    everything = b"".join(question for probe in detect.PROBES for question in probe.ask)
+    for letter in b"mruowxcs":  # ros_arduino_bridge: motors, resets, gains, outputs, servos
+        assert letter not in everything
+    assert b"\x80" not in everything.replace(b"\x80\x15", b"")  # RoboClaw's address, but for its version
+    assert all(word not in everything for word in (b"BM", b"MD", b"GD", b"RS", b"RT", b"\xa5\x20", b"\xa5\x40"))
