@@ -86,6 +86,7 @@ class PtyLink:
         self.path = Path(path)
         self.counters = LinkCounters()
         self._name = self.path.name
+        self._suffix = ""
         self._master: int | None = None
         self._slave: int | None = None
         self.open()
@@ -124,10 +125,11 @@ class PtyLink:
 
     def rename(self, suffix: str) -> None:
         """Come back under another name: the first one with a suffix; none for the first one. Unplugs if it changes."""
-        path = self.path.with_name(self._name + suffix)
-        if path != self.path:
-            self.close()
-            self.path = path
+        if suffix == self._suffix:  # asked at every service: making a path would cost more than the device
+            return
+        self.close()
+        self._suffix = suffix
+        self.path = self.path.with_name(self._name + suffix)
 
     def obstruct(self, *, busy: bool, denied: bool) -> None:
         """Let programs that ask for the port find it held by another (busy) or not permitted (root still may)."""
