@@ -490,7 +490,9 @@ def for_log(
     if not lasers or not table.get("wheels"):
         raise PresetError("playing a log needs a laser and wheels in the configuration")
     name = sorted(lasers)[0]
-    laser = lasers[name]
+    laser: Table = lasers[name]
+    if laser.get("driver") != "hokuyo":  # the one whose steps can be those of any log
+        laser = {"driver": "hokuyo", "port": laser.get("port", "")}
     laser["mount"] = {
         "x_m": round(mount.x_m, 4),
         "y_m": round(mount.y_m, 4),

@@ -9,10 +9,12 @@ from typing import Any
 import pytest
 import serial
 
+from service.config import load
 from sim_devices.attach import Attachment, MemoryLink
+from sim_devices.device import Mount
 from sim_devices.faults import FaultPlan
 from sim_devices.floor_plan import FloorPlan, Wall
-from sim_devices.presets import PresetError, Robot, emulate
+from sim_devices.presets import PRESETS, PresetError, Robot, emulate, for_log, hurry, preset, to_toml
 from sim_devices.robot import CommandedMotion, SimScene, Trajectory, twist
 from sim_devices.world import World
 
@@ -199,6 +201,26 @@ def test_wheels_and_sonars_on_one_port_are_one_board(tmp_path: Path) -> None:
             assert ask(attachment, port, b"p 7\r", 3 * SECOND) == b"0\r\n"
     finally:
         attachment.stop()
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_every_preset_can_play_a_log(name: str, tmp_path: Path) -> None:
+    table = for_log(preset(name), Mount(0.1), track_width_m=0.4, rate_hz=100.0, wheel_m_s=10.0)
+    table["lasers"]["front"]["port"] = "/dev/null"
+    path = tmp_path / "umfeld.toml"
+    path.write_text(to_toml(table))
+    loaded = load(path).config
+    assert loaded.lasers["front"].driver == "hokuyo"
+    assert not loaded.sonars
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_every_preset_can_hurry(name: str, tmp_path: Path) -> None:
+    table = preset(name)
+    hurry(table, 3.0)
+    path = tmp_path / "umfeld.toml"
+    path.write_text(to_toml(table))
+    assert load(path).config.drive.max_wheel_speed_m_s == 15.0
 
 
 def test_unknown_wheels_say_what_there_is(tmp_path: Path) -> None:
