@@ -211,7 +211,8 @@ def test_serial_line_has_its_pace_and_its_rate() -> None:
     assert len(noise) > 1000
     deaf = mavlink.MAVLink(None)
     deaf.robust_parsing = True
-    assert all(m.get_type() == "BAD_DATA" for m in deaf.parse_buffer(noise) or [])
+    heard = {m.get_type() for m in deaf.parse_buffer(noise) or []}
+    assert not heard & {"HEARTBEAT", "ATTITUDE", "ODOMETRY", "WHEEL_DISTANCE", "SYS_STATUS"}
 
 
 # -- how it judges -----------------------------------------------------------------------------------------------------
