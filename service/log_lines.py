@@ -36,13 +36,15 @@ def lines_of_log(
     scan: int | None = None,
     every: int = 1,
     min_seen: int = 2,
+    min_points: int = 12,
     rules: LineRules | None = None,
     progress: Progress | None = None,
 ) -> LogLines:
     """Read a log and find its lines.
 
     scan: only this scan (from 0; negative from the end), in the frame of its laser.  every: only every N-th scan.
-    min_seen: leave out what fewer scans saw.  Raises WrongUsage if the log cannot be read or has no such scan.
+    min_seen, min_points: leave out what fewer scans saw, or fewer points
+    support; a single scan keeps all.  Raises WrongUsage if the log cannot be read or has no such scan.
     """
     try:
         log = read_log(path)
@@ -50,7 +52,7 @@ def lines_of_log(
         raise WrongUsage(str(error)) from error
     if scan is not None:
         return _of_one_scan(log, scan, rules)
-    return _of_run(log, every, min_seen, rules, progress)
+    return _of_run(log, every, min_seen, min_points, rules, progress)
 
 
 def _of_one_scan(log: Log, number: int, rules: LineRules | None) -> LogLines:
@@ -63,7 +65,9 @@ def _of_one_scan(log: Log, number: int, rules: LineRules | None) -> LogLines:
     return LogLines(lines, "laser", report)
 
 
-def _of_run(log: Log, every: int, min_seen: int, rules: LineRules | None, progress: Progress | None) -> LogLines:
+def _of_run(
+    log: Log, every: int, min_seen: int, min_points: int, rules: LineRules | None, progress: Progress | None
+) -> LogLines:
     scans = log.scans[::every]
     extractors: dict[int, LineExtractor] = {}
     line_map, found = LineMap(), 0
@@ -77,8 +81,8 @@ def _of_run(log: Log, every: int, min_seen: int, rules: LineRules | None, progre
         line_map.insert(lines, Pose2(*each.laser_pose))
         if progress is not None and index % 64 == 0:
             progress(index, len(scans))
-    kept = line_map.lines(min_seen=min_seen)
-    map_bytes = len(line_map.to_bytes(min_seen=min_seen))
+    kept = line_map.lines(min_seen=min_seen, min_count=min_points)
+    map_bytes = len(line_map.to_bytes(min_seen=min_seen, min_count=min_points))
     scan_bytes = sum(4 * each.range_m.size for each in scans)
     report: dict[str, object] = {
         "log": log.provenance.path,

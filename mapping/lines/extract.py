@@ -47,7 +47,7 @@ class LineRules:
     flat_m: float = 0.003
     merge_chi2: float = 13.8
     smallest: int = 2
-    min_points: int = 6
+    min_points: int = 5
     min_length_m: float = 0.25
     sigma_m: float = 0.01
     sigma_per_m: float = 0.0

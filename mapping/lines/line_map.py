@@ -177,12 +177,12 @@ class LineMap:
 
     # -------------------------------------------------------------------------------------------------------- bytes
 
-    def to_bytes(self, *, min_seen: int = 1) -> bytes:
-        """The lines that at least min_seen scans saw, in 20 bytes a line and 12 in all: ends in tenths of a millimetre,
+    def to_bytes(self, *, min_seen: int = 1, min_count: int = 0) -> bytes:
+        """The lines with so many scans and points, in 20 bytes a line and 12 in all: ends in tenths of a millimetre,
         supporting points (up to 65,535), scans (up to 255), rms distance (in quarters of a millimetre, up to 64 mm).
         How the points lay is lost: `from_bytes` spreads them evenly.
         """
-        lines = self.lines(min_seen=min_seen)
+        lines = self.lines(min_seen=min_seen, min_count=min_count)
         packed = np.empty(len(lines), dtype=_PACKED)
         scaled = np.rint(lines.rows[:, : kernels.WEIGHT] * 1e4)
         if len(lines) and float(np.abs(scaled).max()) > np.iinfo(np.int32).max:

@@ -27,6 +27,7 @@ def lines(
     scan: Annotated[int | None, typer.Option(help="Only this scan, from 0, in the laser's frame.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Use every N-th scan.")] = 1,
     min_seen: Annotated[int, typer.Option(min=1, help="Leave out what fewer scans saw.")] = 2,
+    min_points: Annotated[int, typer.Option(min=1, help="Leave out what fewer points support.")] = 12,
     as_json: Annotated[bool, typer.Option("--json", help="Report as JSON; needs --out or --png.")] = False,
 ) -> None:
     """Straight walls: of one scan, or of a whole run as a map, by the poses in the log.
@@ -39,7 +40,7 @@ def lines(
 
     if as_json and out is None and png is None:
         raise WrongUsage("--json reports on files: say where with --out or --png (without them GeoJSON is printed)")
-    found = lines_of_log(file, scan=scan, every=every, min_seen=min_seen)
+    found = lines_of_log(file, scan=scan, every=every, min_seen=min_seen, min_points=min_points)
     if out is None and png is None:
         typer.echo(geojson_bytes(found.lines, frame=found.frame).decode(), nl=False)
         return

@@ -418,7 +418,9 @@ def test_recorded_runs_become_small_maps(name: str, median_m: float, times_small
                 r, a = scan.range_m[part], scan.bearing_rad[part]
                 supports.append(pose.apply(np.stack((r * np.cos(a), r * np.sin(a)), axis=-1)))
     points = np.concatenate(supports)
-    distance = line_map.lines(min_seen=2).distance_to(points).min(axis=1)
-    assert len(line_map.to_bytes(min_seen=2)) * times_smaller <= sum(s.range_m.size * 4 for s in log.scans)
+    distance = line_map.lines(min_seen=2, min_count=12).distance_to(points).min(axis=1)
+    assert len(line_map.to_bytes(min_seen=2, min_count=12)) * times_smaller <= sum(
+        s.range_m.size * 4 for s in log.scans
+    )
     assert float(np.mean(distance < 0.1)) >= 0.9
     assert float(np.median(distance)) <= median_m
