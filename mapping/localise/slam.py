@@ -598,6 +598,14 @@ class Slam:
         poses = composed_poses(self._poses[keys], np.array(self._scan_in_key))
         return np.array(self._stamps, dtype=np.int64), poses
 
+    def path_between(self, first: int, last: int) -> list[tuple[Pose2, F64]]:
+        """Measured motions between successive key scans, and their information (3, 3), from scan `first` to `last`."""
+        return self._path[self._scan_key[first] : self._scan_key[last]]
+
+    def key_stamps(self) -> tuple[int, ...]:
+        """When key scans were taken."""
+        return tuple(self._key_stamps)
+
     def key_poses(self) -> F64:
         """(K, 3) base poses of key scans."""
         mounts = np.array([_row(p.inverse()) for p in self._base_from_sensor]).reshape(-1, 3)
