@@ -82,6 +82,7 @@ def _program(name: str) -> ModuleType:
 
 
 def _figure(name: str, value: float, unit: str, budget: float | None) -> dict[str, Any]:
+    value = float(value)  # numpy's own floats and truths are no JSON
     return {"name": name, "value": value, "unit": unit, "budget": budget, "ok": budget is None or value <= budget}
 
 
