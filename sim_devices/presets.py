@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sim_devices.attach import Attachment, PtyLink, TcpLink
 from sim_devices.device import ByteDevice, CanDevice, Mount, Scene
@@ -27,15 +27,20 @@ from sim_devices.lasers import FIRST_MODEL, MODELS, make_laser
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.sonar_maxbotix import FAMILIES, MaxBotix, TextMultiplexer
 from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardCan, UsBoardSerial, default_parameters
+from sim_devices.udp_link import UdpLink
 from sim_devices.wheel import Side, Wheel
+
+if TYPE_CHECKING:  # pymavlink is for robots with an autopilot only
+    from sim_devices.mavlink_autopilot import MavlinkAutopilot
 
 Table = dict[str, Any]
 
 SIDES: tuple[Side, Side] = ("left", "right")
 BRIDGE = "arduino-bridge"
+MAVLINK = "mavlink"
 FIRST_NODE = {"cia406": 0x20, "odrive": 0, "vesc": 1}  # one node a wheel on a CAN bus
-WHEEL_DRIVERS = (BRIDGE, "roboclaw", *FIRST_NODE)
-SONAR_DRIVERS = ("usboard", "usboard-serial", "maxbotix", BRIDGE)
+WHEEL_DRIVERS = (BRIDGE, "roboclaw", MAVLINK, *FIRST_NODE)
+SONAR_DRIVERS = ("usboard", "usboard-serial", "maxbotix", BRIDGE, MAVLINK)
 TICK_LIMITED = (BRIDGE, "roboclaw", "vesc")  # their limit of speed is max_ticks_per_s, others' max_turns_per_s
 
 HOST = "host"  # the daemon's adapter on every bus
@@ -50,17 +55,18 @@ class PresetError(ValueError):
 class Robot:
     """An emulated robot on its wires.
 
-    config: the daemon's configuration for it.  links: every pty or TCP port, under its station's name ("lasers.front",
-    "can.main").
-    buses, lasers, sonars, encoders: by their names in the configuration (encoders as "drive.left").
+    config: the daemon's configuration for it.  links: every pty, TCP or UDP port, under its station's name
+    ("lasers.front", "can.main").  buses, lasers, sonars, encoders: by their names in the configuration (encoders as
+    "drive.left").  autopilots: by their stations' names.
     """
 
     config: Table
-    links: dict[str, PtyLink | TcpLink] = field(default_factory=dict)
+    links: dict[str, PtyLink | TcpLink | UdpLink] = field(default_factory=dict)
     buses: dict[str, CanBusStation] = field(default_factory=dict)
     lasers: dict[str, ByteDevice] = field(default_factory=dict)
     sonars: dict[str, UsBoard] = field(default_factory=dict)
     encoders: dict[str, Cia406Encoder] = field(default_factory=dict)
+    autopilots: dict[str, MavlinkAutopilot] = field(default_factory=dict)
 
     def was_spoken_to(self) -> bool:
         """Whether a host has sent anything on any wire yet."""
@@ -84,7 +90,8 @@ def emulate(
     folder: where the ptys' links stand.  laser: model of all lasers, whatever the configuration says; default: the
     first of each laser's driver.  profile: of a Hokuyo that is no model.  exact: no noise on lasers (recorded ranges
     have theirs).  plan: faults; its targets are laser.NAME, sonar.NAME, encoder.left and .right, bus.NAME, and
-    adapter.NAME, the daemon's port on that bus.  Raises PresetError for a device that cannot be emulated.
+    adapter.NAME, the daemon's port on that bus; autopilot, or autopilot.1, .2 if there are
+    several.  Raises PresetError for a device that cannot be emulated.
     """
     robot = Robot(copy.deepcopy(dict(config)))
     builder = _Builder(robot, scene, attachment, folder, plan or FaultPlan(seed=seed), faulty=plan is not None)
@@ -98,6 +105,9 @@ def emulate(
         builder.add_wheels(name, wheels)
     for port in builder.bridge_ports():
         builder.add_bridge(port)
+    ports = builder.autopilot_ports()
+    for k, port in enumerate(ports, 1):
+        builder.add_autopilot(port, "autopilot" if len(ports) == 1 else f"autopilot.{k}")
     return robot
 
 
@@ -160,8 +170,8 @@ class _Builder:
 
     def add_sonar(self, name: str, sonar: Table, *, seed: int) -> None:
         driver = _required(sonar, f"sonars.{name}", SONAR_DRIVERS)
-        if driver == BRIDGE:
-            return  # see add_bridge
+        if driver in (BRIDGE, MAVLINK):
+            return  # see add_bridge and add_autopilot
         target = f"sonar.{name}"
         if driver == "maxbotix":
             device = self._maxbotix(sonar, self._seen(target), f"sonars.{name}", seed)
@@ -201,10 +211,10 @@ class _Builder:
 
     def bridge_ports(self) -> list[str]:
         """The ports of such boards, as the configuration names them."""
-        return list(dict.fromkeys(str(table.get("port")) for _, _, table in self._bridge_members()))
+        return list(dict.fromkeys(str(table.get("port")) for _, _, table in self._members(BRIDGE)))
 
     def add_bridge(self, port: str) -> None:
-        members = [member for member in self._bridge_members() if str(member[2].get("port")) == port]
+        members = [member for member in self._members(BRIDGE) if str(member[2].get("port")) == port]
         tables = [table for _, _, table in members]
         wheels = [name for section, name, _ in members if section == "wheels"]
         sonars = [name for section, name, _ in members if section == "sonars"]
@@ -223,22 +233,73 @@ class _Builder:
         place = f"wheels.{wheels[0]}" if wheels else f"sonars.{sonars[0]}"
         self._attach_serial(place, place.replace(".", "-"), tables, target, board)
 
-    def _bridge_members(self) -> list[tuple[str, str, Table]]:
-        """Section, name and table of everything on such boards."""
+    def _members(self, driver: str) -> list[tuple[str, str, Table]]:
+        """Section, name and table of everything that hangs on boards with this driver."""
         return [
             (section, name, table)
             for section in ("wheels", "sonars")
             for name, table in self.robot.config.get(section, {}).items()
-            if table.get("driver") == BRIDGE
+            if table.get("driver") == driver
         ]
+
+    # -- autopilots: wheels, sonars and the map that is sent to one, where they name the same port ---------------------
+
+    def autopilot_ports(self) -> list[str]:
+        """The ports of autopilots, as the configuration names them."""
+        return list(dict.fromkeys(str(table.get("port")) for table in self._autopilot_tables()))
+
+    def _autopilot_tables(self) -> list[Table]:
+        tables = [table for _, _, table in self._members(MAVLINK)]
+        sending = self.robot.config.get("mavlink", {})
+        if sending.get("enabled"):
+            sending.setdefault("port", "udpout:127.0.0.1:14550")
+            tables.append(sending)
+        return tables
+
+    def add_autopilot(self, port: str, target: str) -> None:
+        from sim_devices.mavlink_autopilot import MavlinkAutopilot, Rangefinder
+
+        here = [(section, table) for section, _, table in self._members(MAVLINK) if str(table.get("port")) == port]
+        wheels = next((table for section, table in here if section == "wheels"), {})
+        sonars = next((table for section, table in here if section == "sonars"), {})
+        finders = [
+            Rangefinder(
+                channel - 1,
+                mount,
+                min_cm=max(1, round(100.0 * float(sonars.get("range_min_m", 0.02)))),
+                max_cm=round(100.0 * float(sonars.get("range_max_m", 3.0))),
+                half_angle_rad=_half_cone_rad(sonars),
+            )
+            for channel, mount in sorted(_transducer_mounts(sonars).items())
+        ]
+        tables = [table for table in self._autopilot_tables() if str(table.get("port")) == port]
+        on_udp = port.startswith("udp")
+        pilot = MavlinkAutopilot(
+            self._seen(target),
+            system=next((int(t[key]) for t in tables for key in ("system", "system_id") if t.get(key)), 1),
+            line_rate_bps=None if on_udp else int(tables[0].get("baud_bps", 57600)),
+            rangefinders=finders,
+            wheels=(int(wheels.get("wheel_left", 0)), int(wheels.get("wheel_right", 1))),
+            track_width_m=float(self.robot.config.get("drive", {}).get("track_width_m", 0.5)),
+        )
+        self.robot.autopilots[target] = pilot
+        if not on_udp:
+            self._attach_serial(target, target.replace(".", "-"), tables, target, pilot)
+            return
+        link = UdpLink(int(port.rpartition(":")[2]) if port.startswith("udpin") else None)
+        if port.startswith("udpout"):
+            for table in tables:
+                table["port"] = f"udpout:{link.host}:{link.port}"
+        self.attachment.add(target, self.plan.device(target, pilot) if self.faulty else pilot, link)
+        self.robot.links[target] = link
 
     # -- wheels -------------------------------------------------------------------------------------------------------
 
     def add_wheels(self, name: str, wheels: Table) -> None:
         driver = _required(wheels, f"wheels.{name}", WHEEL_DRIVERS)
         target = self._wheels_target(name)
-        if driver == BRIDGE:
-            return  # see add_bridge
+        if driver in (BRIDGE, MAVLINK):
+            return  # see add_bridge and add_autopilot
         if driver == "roboclaw":
             first, second = self._wheel_pair(self._seen(target))
             if int(wheels.get("left_motor", 1)) == 2:
@@ -430,6 +491,21 @@ def odrive() -> Table:
     return table
 
 
+def autopilot() -> Table:
+    """A rover: an autopilot counts its wheels, pings and is told of obstacles; an RPLIDAR on top."""
+    port = "/dev/ttyACM0"
+    laser = {"driver": "rplidar", "port": "/dev/ttyUSB0", "mount": {"x_m": 0.0, "y_m": 0.0, "z_m": 0.20}}
+    micrometres = round(2.0 * math.pi * 0.0325 * 1e6, 3)  # a tick of an autopilot's wheel
+    table = _small("autopilot", laser, {"driver": MAVLINK, "port": port}, ticks_per_turn=micrometres)
+    pings = [_transducer(k, yaw, half_length_m=0.15, half_width_m=0.11) for k, yaw in ((1, 0.0), (2, 180.0))]
+    table["sonars"] = {
+        "ends": {"driver": MAVLINK, "port": port, "cone_deg": 30.0, "range_max_m": 4.0, "transducers": pings}
+    }
+    table["sectors"]["rect"]["around"]["sources"].append("sonars.ends")
+    table["mavlink"] = {"enabled": True, "map": "laser", "port": "udpout:127.0.0.1:14550"}
+    return table
+
+
 def _small(name: str, laser: Table, wheels: Table, *, ticks_per_turn: float) -> Table:
     """What the small robots share: the body, one laser that sees all round, the usual maps."""
     return {
@@ -459,6 +535,8 @@ def hurry(config: Table, speed: float) -> None:
     """Let the daemon believe wheels that turn so many times faster than in real time."""
     config.setdefault("drive", {})["max_wheel_speed_m_s"] = 5.0 * speed
     for wheels in config.get("wheels", {}).values():
+        if wheels.get("driver") == MAVLINK:
+            continue  # has no such limit
         limit, value = ("max_ticks_per_s", 2e5) if wheels.get("driver") in TICK_LIMITED else ("max_turns_per_s", 20.0)
         wheels[limit] = max(float(wheels.get(limit, 0.0)), value) * speed
 
@@ -468,6 +546,7 @@ PRESETS: dict[str, Callable[[], Table]] = {
     "two_wheeler": two_wheeler,
     "roboclaw": roboclaw,
     "odrive": odrive,
+    "autopilot": autopilot,
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import socket
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,9 @@ def test_the_daemon_accepts_what_a_preset_prints(name: str, tmp_path: Path) -> N
             assert Path(bus.channel).is_symlink()
         for wheels in loaded.wheels.values():
             assert wheels.serial_port() is None or Path(wheels.serial_port() or "").is_symlink()
-        polar, rect, transducers = {"artos": (3, 1, 16), "two_wheeler": (1, 1, 2)}.get(name, (1, 1, 0))
+        polar, rect, transducers = {"artos": (3, 1, 16), "two_wheeler": (1, 1, 2), "autopilot": (1, 1, 2)}.get(
+            name, (1, 1, 0)
+        )
         assert (len(loaded.sectors.polar), len(loaded.sectors.rect)) == (polar, rect)
         assert sum(len(s.transducers) for s in loaded.sonars.values()) == transducers
     finally:
@@ -240,5 +243,39 @@ def test_configured_driver_chooses_the_model(tmp_path: Path) -> None:
         robot = emulate(config, motionless(), attachment, tmp_path)
         assert type(robot.lasers["low"]).__name__ == "LdLidar"
         assert robot.config["lasers"]["high"]["port"].startswith("tcp://127.0.0.1:")
+    finally:
+        attachment.stop()
+
+
+def test_autopilots_serve_whatever_names_their_port(tmp_path: Path) -> None:
+    config = preset("autopilot")
+    attachment = Attachment(clock=lambda: 0)
+    try:
+        robot = emulate(config, motionless(), attachment, tmp_path, plan=FaultPlan())
+        assert sorted(robot.autopilots) == ["autopilot.1", "autopilot.2"]
+        source, sent = robot.config["wheels"]["drive"]["port"], robot.config["mavlink"]["port"]
+        assert source == robot.config["sonars"]["ends"]["port"]
+        assert Path(source).is_symlink()
+        port = int(sent.removeprefix("udpout:127.0.0.1:"))
+        assert port == getattr(robot.links["autopilot.2"], "port", None)
+        assert [r.number for r in robot.autopilots["autopilot.1"].rangefinders] == [0, 1]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as daemon:
+            daemon.sendto(b"hello", ("127.0.0.1", port))
+            attachment.service(0)
+            attachment.service(2_000_000_000)
+            daemon.settimeout(5.0)
+            assert daemon.recv(2000)[0] == 0xFD
+    finally:
+        attachment.stop()
+
+
+def test_one_autopilot_for_all_on_one_port(tmp_path: Path) -> None:
+    config = preset("autopilot")
+    config["mavlink"]["port"] = config["wheels"]["drive"]["port"]
+    attachment = Attachment(clock=lambda: 0)
+    try:
+        robot = emulate(config, motionless(), attachment, tmp_path)
+        assert list(robot.autopilots) == ["autopilot"]
+        assert robot.config["mavlink"]["port"] == robot.config["wheels"]["drive"]["port"]
     finally:
         attachment.stop()
