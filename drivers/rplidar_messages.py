@@ -350,10 +350,14 @@ class _CapsuleStream:
                 self._lose()
                 at += 1
                 continue
+            if capsule.is_first and self._span_rad is not None:
+                self._counters.drop("bad_first")  # no scan begins in the middle of one
+                self._lose()
+                at += 1
+                continue
             at += 84
             if capsule.is_first:
                 self._gap = self._gap or self._before is not None
-                self._span_rad = None
             elif self._before is not None:
                 self._tell(*self._before, capsule.start_rad, found)
             self._before = (capsule, stamp_ns, len(data) - at)

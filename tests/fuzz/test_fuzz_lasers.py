@@ -93,7 +93,7 @@ Key = object
 
 @dataclass(frozen=True)
 class Protocol:
-    """before, damaged one, behind are consecutive messages of a stream; read gives keys of what was accepted."""
+    """stream: messages before, the one to damage, at least two behind; read gives keys of what was accepted."""
 
     name: str
     stream: Callable[[Rng], list[bytes]]
@@ -103,13 +103,13 @@ class Protocol:
 
 def sick_stream(rng: Rng) -> list[bytes]:
     frames = []
-    for _ in range(3):
+    for _ in range(4):
         payload = (
             b"\xb0" + struct.pack("<H", 101 | 0x4000) + rng.integers(0, 0x1FFF, 101).astype("<u2").tobytes() + b"\x10"
         )
         frame = struct.pack("<BBH", 2, 0x80, len(payload)) + payload
         frames.append(frame + struct.pack("<H", crc16_sick(frame)))
-    return frames
+    return [frames[0], frames[1], b"".join(frames[2:])]
 
 
 def read_sick(data: bytes) -> list[Key]:
@@ -138,14 +138,14 @@ def read_ld(data: bytes) -> list[Key]:
 
 def cola_stream(rng: Rng) -> list[bytes]:
     frames = []
-    for number in range(3):
+    for number in range(4):
         fixed = (1, 1, 18480390, 0, number, number, 66_667 * number, 66_667 * number + 6_000, 0, 0, 0, 1500, 162, 0)
         payload = b"sSN LMDscandata " + struct.pack(">HHIHHHIIHHHIIH", *fixed) + b"\0\x01DIST1"
         payload += struct.pack(">ffiHH", 1.0, 0.0, -450000, 5000, 60)
         payload += rng.integers(200, 9000, 60).astype(">u2").tobytes()
         payload += bytes(8) + b"\0\x01\x07\xb2\x01\x01\0\x32\x0e\0\x02\x13\x40" + bytes(2)
         frames.append(b"\x02\x02\x02\x02" + struct.pack(">I", len(payload)) + payload + bytes([reduce(xor, payload)]))
-    return frames
+    return [frames[0], frames[1], b"".join(frames[2:])]
 
 
 def read_cola(data: bytes) -> list[Key]:
@@ -163,7 +163,7 @@ def capsule_stream(rng: Rng) -> list[bytes]:
     """From the begin of a scan, so that the head's speed is known; a capsule is told with the one behind it."""
     start = int(rng.integers(0, 300 * 64))
     capsules = []
-    for number in range(8):
+    for number in range(14):
         body = struct.pack("<H", (start + number * 14 * 64) % 23040 | (0x8000 if number == 0 else 0)) + rng.bytes(80)
         total = reduce(xor, body)
         capsules.append(bytes([0xA0 | total & 15, 0x50 | total >> 4]) + body)
