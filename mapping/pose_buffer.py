@@ -36,6 +36,7 @@ class PoseBuffer:
         self._stretch: I64 = np.zeros(2 * capacity, dtype=np.int64)
         self._begin = 0
         self._end = 0
+        self._stretch_since_ns = 0  # stamp of the first pose of the present stretch
 
     def __len__(self) -> int:
         return self._end - self._begin
@@ -45,8 +46,7 @@ class PoseBuffer:
         """Stamp of the oldest pose of the present stretch; None when empty."""
         if not len(self):
             return None
-        same = self._stretch[self._begin : self._end] == self._stretch[self._end - 1]
-        return int(self._stamp_ns[self._begin + int(np.argmax(same))])
+        return max(self._stretch_since_ns, int(self._stamp_ns[self._begin]))
 
     @property
     def newest_ns(self) -> int | None:
@@ -61,6 +61,8 @@ class PoseBuffer:
         if self._end == len(self._stamp_ns):
             self._move_to_front()
         stretch = int(self._stretch[self._end - 1]) + after_break if len(self) else 0
+        if after_break or not len(self):
+            self._stretch_since_ns = stamp_ns
         self._stamp_ns[self._end] = stamp_ns
         self._pose[self._end] = (pose.x_m, pose.y_m, pose.yaw_rad)
         self._stretch[self._end] = stretch

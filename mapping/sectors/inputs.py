@@ -13,9 +13,16 @@ from mapping.sectors.sight import Sight, arc_of_cone, end_points, median_spacing
 
 F64 = NDArray[np.float64]
 
-CONES_REMEMBERED = 512
-"""How many of its findings about cones a map keeps: sonars stand still on the robot and tell whole centimetres or
-less, so the same few distances come again and again, and what each says of the sectors is worked out once."""
+_BYTES_REMEMBERED = 4 << 20
+
+
+def cones_remembered(sectors: int) -> int:
+    """How many of its findings about cones a map of so many sectors keeps.
+
+    Sonars stand still on the robot and mostly tell whole centimetres, so the same distances come again and again; what
+    each says of the sectors is worked out once. 16 sonars of 3 m have 4800 of them: 4 MB for a polar map.
+    """
+    return max(256, _BYTES_REMEMBERED // (33 * sectors + 500))  # four doubles and a truth a sector, and their heads
 
 
 class SpacingMemory:

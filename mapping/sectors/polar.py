@@ -12,7 +12,7 @@ from mapping.frames import IDENTITY, Pose2
 from mapping.kernels import sectors as kernels
 from mapping.sectors.evidence import Evidence, Finding
 from mapping.sectors.footprint import Outline, checked_polygon
-from mapping.sectors.inputs import CONES_REMEMBERED, SpacingMemory, checked_beams, see_beams, see_cone, without_self
+from mapping.sectors.inputs import SpacingMemory, checked_beams, cones_remembered, see_beams, see_cone, without_self
 from mapping.sectors.sight import Sight, arc_of_cone
 from mapping.sectors.snapshot import PolarSnapshot, SectorState
 
@@ -74,7 +74,7 @@ class PolarSectors:
         self._footprint = checked_polygon(footprint) if footprint is not None and self_filter else None
         self._frame = _Wedges(self.edges_rad, sector_rad, range_max_m, self._outline)
         self._spacing = SpacingMemory()
-        self._heard = lru_cache(CONES_REMEMBERED)(self._find_in_cone)
+        self._heard = lru_cache(cones_remembered(len(self.edges_rad) - 1))(self._find_in_cone)
         self._evidence = Evidence(
             count=len(self.edges_rad) - 1,
             sources=tuple(sources),

@@ -12,7 +12,7 @@ from mapping.frames import IDENTITY, Pose2
 from mapping.kernels import sectors as kernels
 from mapping.sectors.evidence import Evidence, Finding
 from mapping.sectors.footprint import Outline, checked_polygon
-from mapping.sectors.inputs import CONES_REMEMBERED, SpacingMemory, checked_beams, see_beams, see_cone, without_self
+from mapping.sectors.inputs import SpacingMemory, checked_beams, cones_remembered, see_beams, see_cone, without_self
 from mapping.sectors.sight import Sight, arc_of_cone
 from mapping.sectors.snapshot import RectSnapshot
 
@@ -56,7 +56,7 @@ class RectSectors:
             raise ValueError(f"{self._shape[0]} x {self._shape[1]} sectors are too many: enlarge sector_m")
         self._raster = _Raster(self.x_edges_m, self.y_edges_m, sector_m, Outline(footprint, base_from_sensor))
         self._spacing = SpacingMemory()
-        self._heard = lru_cache(CONES_REMEMBERED)(self._find_in_cone)
+        self._heard = lru_cache(cones_remembered(self._shape[0] * self._shape[1]))(self._find_in_cone)
         self._evidence = Evidence(
             count=self._shape[0] * self._shape[1],
             sources=tuple(sources),
