@@ -78,6 +78,8 @@ def fill_table(
         if not (r >= nearest_m and r <= farthest_m) or not math.isfinite(bearing[i]):
             continue
         b = bin_of(bearing[i], frame)
+        if frame[CLOSED] > 0.0:
+            b %= bins
         if 0 <= b < bins:
             at[i] = b
             front[b] = min(front[b], r)

@@ -49,6 +49,7 @@ def table_for(bearing_rad: F64) -> BearingTable:
     are fewer than 3 finite bearings.
     """
     turn = 2.0 * math.pi
+    # Bins lie centred on the first sweep's beams, so that rounding never moves a beam into its neighbour's.
     sorted_rad = np.unique(np.mod(bearing_rad[np.isfinite(bearing_rad)], turn))
     if len(sorted_rad) < 3:
         raise ValueError("a scan needs at least three beams to be matched")
@@ -59,11 +60,10 @@ def table_for(bearing_rad: F64) -> BearingTable:
     open_rad = float(gaps[widest])
     if open_rad < max(math.radians(20.0), 4.0 * width):
         bins = min(MOST_BINS, max(8, round(turn / width)))
-        return BearingTable(-math.pi, turn / bins, bins, True)
+        return BearingTable(float(sorted_rad[0]) - 0.5 * turn / bins, turn / bins, bins, True)
     field = turn - open_rad
     width = max(width, (field + 2.0 * MARGIN_RAD) / (MOST_BINS - 2))
     margin = math.ceil(min(MARGIN_RAD, 0.4 * open_rad) / width)
-    # Bins lie centred on the first sweep's beams, so that rounding never moves a beam into its neighbour's.
     first = float(sorted_rad[(widest + 1) % len(sorted_rad)]) - (margin + 0.5) * width
     return BearingTable(first, width, round(field / width) + 1 + 2 * margin, False)
 

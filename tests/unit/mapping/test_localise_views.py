@@ -1,0 +1,132 @@
+"""Tables of bearings: any laser's sweep, in any order, gives the same points, and the walls' normals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapping.kernels.localise_match import EMPTY, bearing_of, bin_of
+from mapping.localise.views import MOST_BINS, ViewStore, table_for, view_of
+from mapping.scan import Scan
+
+F64 = NDArray[np.float64]
+
+
+def room_scan(bearing: F64, *, half_m: float = 2.0, yaw: float = 0.0) -> Scan:
+    """A square room seen from its middle."""
+    c, s = np.abs(np.cos(bearing + yaw)), np.abs(np.sin(bearing + yaw))
+    return Scan(0, 0.0, bearing, half_m / np.maximum(c, s), 0.05, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "bins", "closed"),
+    [
+        (np.arange(-90.0, 90.0, 1.0), 192, False),
+        (np.arange(-90.0, 90.5, 0.5), 385, False),
+        (np.arange(-135.0, 135.25, 0.25), 720, False),
+        (np.arange(0.0, 360.0, 1.0), 360, True),
+        (-np.arange(0.0, 360.0, 0.8), 450, True),
+    ],
+)
+def test_a_table_fits_the_laser(degrees: F64, bins: int, closed: bool) -> None:
+    table = table_for(np.radians(degrees))
+    assert table.closed is closed
+    assert abs(table.bins - bins) <= 2
+    assert table.bins <= MOST_BINS
+    at = np.array([bin_of(float(b), table.frame()) for b in np.radians(degrees)])
+    assert at.min() >= 0
+    assert at.max() < table.bins
+    if len(degrees) <= table.bins:
+        assert len(np.unique(at)) == len(degrees)  # no two beams of the first sweep share a bin
+
+
+def test_a_field_of_view_over_the_back_is_one_piece() -> None:
+    table = table_for(np.radians(np.arange(100.0, 260.0, 1.0)))
+    assert not table.closed
+    assert bin_of(math.pi, table.frame()) == bin_of(-math.pi, table.frame())
+    assert 0 <= bin_of(math.radians(-120.0), table.frame()) < table.bins
+
+
+def test_two_beams_are_no_scan() -> None:
+    with pytest.raises(ValueError, match="three beams"):
+        table_for(np.array([0.0, 0.1, np.nan]))
+
+
+@pytest.mark.parametrize("order", ["forward", "backward", "shuffled"])
+def test_the_order_of_beams_does_not_matter(order: str) -> None:
+    bearing = np.radians(np.arange(-135.0, 135.5, 0.5))
+    scan = room_scan(bearing)
+    table = table_for(bearing)
+    index = {"forward": np.arange(len(bearing)), "backward": np.arange(len(bearing))[::-1]}.get(
+        order, np.random.default_rng(0).permutation(len(bearing))
+    )
+    other = Scan(0, 0.0, bearing[index], scan.range_m[index], 0.05, 30.0)
+    a, b = view_of(scan, table, farthest_m=30.0), view_of(other, table, farthest_m=30.0)
+    for name in ("x", "y", "nx", "ny", "quality"):
+        assert np.array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_points_and_normals_are_those_of_the_walls() -> None:
+    bearing = np.radians(np.arange(-180.0, 180.0, 0.5))
+    view = view_of(room_scan(bearing, yaw=0.3), table_for(bearing), farthest_m=30.0)
+    assert view.points == len(bearing)
+    turned = np.array([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
+    points = np.stack((view.x, view.y), axis=-1).astype(np.float64) @ turned.T
+    assert np.abs(np.abs(points).max(axis=1) - 2.0).max() < 2e-6
+    normals = np.stack((view.nx, view.ny), axis=-1).astype(np.float64) @ turned.T
+    flat = (view.quality > 0.0) & (np.abs(points).min(axis=1) < 1.7)  # away from the corners
+    assert flat.sum() > 500
+    inwards = -points * (np.abs(points) > 1.99) / 2.0
+    assert np.abs(normals[flat] - inwards[flat]).max() < 1e-3
+    assert np.all(view.quality[flat] > 0.99)
+
+
+def test_what_is_no_reading_leaves_an_empty_bin() -> None:
+    bearing = np.radians(np.arange(-90.0, 91.0, 1.0))
+    distance = np.full(181, 3.0)
+    distance[[10, 20, 30, 40, 50]] = [np.nan, np.inf, -np.inf, 0.01, 31.0]
+    view = view_of(Scan(0, 0.0, bearing, distance, 0.05, 80.0), table_for(bearing), farthest_m=30.0)
+    assert view.points == 176
+    assert np.all((view.x == 0.0) == (view.quality == EMPTY))
+
+
+def test_a_bin_takes_the_nearest_surface_only() -> None:
+    table = table_for(np.radians(np.arange(-90.0, 91.0, 1.0)))
+    bearing = np.radians([0.0, 0.1, 0.2, -0.1])
+    view = view_of(Scan(0, 0.0, bearing, np.array([2.0, 2.02, 5.0, 2.04]), 0.05, 30.0), table, farthest_m=30.0)
+    assert view.points == 1
+    assert float(view.x.max()) == pytest.approx(2.02, abs=1e-3)
+
+
+def test_lengths_that_differ_are_refused() -> None:
+    table = table_for(np.radians(np.arange(-90.0, 91.0, 1.0)))
+    with pytest.raises(ValueError, match="one length"):
+        view_of(Scan(0, 0.0, np.zeros(3), np.ones(4), 0.05, 30.0), table, farthest_m=30.0)
+
+
+def test_a_store_gives_back_what_it_took_and_keeps_old_copies() -> None:
+    wide, narrow = np.radians(np.arange(-90.0, 90.5, 0.5)), np.radians(np.arange(0.0, 360.0, 2.0))
+    store = ViewStore()
+    first = view_of(room_scan(narrow), table_for(narrow), farthest_m=30.0)
+    store.add(first)
+    before = store.arrays()
+    for _ in range(100):
+        store.add(view_of(room_scan(wide), table_for(wide), farthest_m=30.0))
+    assert before.count == 1
+    for arrays in (before, store.arrays()):
+        again = arrays.view(0)
+        assert again.table == first.table
+        assert np.array_equal(again.x, first.x)
+        assert again.normals == first.normals
+    assert len(store) == 101
+
+
+def test_quick_bearings_are_bearings() -> None:
+    rng = np.random.default_rng(0)
+    for x, y in rng.normal(0.0, 5.0, (2000, 2)):
+        assert bearing_of(x, y) == pytest.approx(math.atan2(y, x), abs=1e-5)
+    for x, y in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (-1.0, 1e-300)):
+        assert bearing_of(x, y) == pytest.approx(math.atan2(y, x), abs=1e-5)
