@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,8 @@ from scipy.spatial import cKDTree
 from mapping.lines.lines import Lines, as_points
 
 F64 = NDArray[np.float64]
+
+_NARROW_M: Final = 0.05  # narrower on average, a ring is no room
 
 
 class OutlineKind(Enum):
@@ -119,7 +122,16 @@ def _outline(lines: Lines, chain: list[int], closed: bool, join_m: float) -> Out
     if not closed:
         points.append(lines.end_m[chain[-1]])
     polygon = np.array(points)
-    return Outline(polygon, tuple(chain), kind_of_polygon(polygon) if closed else OutlineKind.OPEN)
+    return Outline(polygon, tuple(chain), _kind_of_ring(polygon) if closed else OutlineKind.OPEN)
+
+
+def _kind_of_ring(polygon: F64) -> OutlineKind:
+    """As kind_of_polygon, but what is too narrow to be a room is an obstacle: both sides of a partition, whose noise
+    can turn the ring inside out."""
+    around = float(np.sum(np.hypot(*(np.roll(polygon, -1, axis=0) - polygon).T)))
+    if abs(signed_area(polygon)) < 0.5 * _NARROW_M * around:
+        return OutlineKind.OBSTACLE
+    return kind_of_polygon(polygon)
 
 
 def _corner(lines: Lines, here: int, following: int, join_m: float) -> F64 | None:

@@ -149,6 +149,12 @@ def test_rooms_are_clockwise_obstacles_counter_clockwise() -> None:
     assert len(room[0].points_m) == 4
 
 
+def test_partition_is_an_obstacle_even_if_noise_turns_it_inside_out() -> None:
+    for across in (0.01, -0.01):
+        faces = line(0.0, across, 4.0, across, 4.0, 0.0, 0.0, 0.0)
+        assert [outline.kind for outline in outlines(faces)] == [OutlineKind.OBSTACLE]
+
+
 def test_outline_of_an_open_chain_keeps_its_ends() -> None:
     chain = outlines(line(0.0, 0.0, 2.0, 0.0, 2.1, 0.1, 2.1, 3.0, 9.0, 9.0, 8.0, 9.0))
     assert sorted(len(each.members) for each in chain) == [1, 2]
