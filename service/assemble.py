@@ -515,6 +515,11 @@ def parts(config: Config, found: Mapping[str, Sensor], made: Maps, localiser: Lo
     )
 
 
+def localiser(config: Config, start_pose: Pose2) -> Localiser:
+    """What says where the odom frame lies in the map; the same for a daemon and for a replay of what it recorded."""
+    return OdometryOnly(start_pose)
+
+
 def geometry_of(drive: Drive) -> DriveGeometry:
     """How counts become motion."""
     return DriveGeometry(

@@ -32,7 +32,6 @@ from service import assemble, health, recording
 from service.clock import Clock, SystemClock
 from service.config import Config, Loaded
 from service.errors import Trouble
-from service.fusion import OdometryOnly
 from service.live_map import LiveMap, restore
 from service.locks import Claims
 from service.outputs import HealthOut, Output
@@ -127,9 +126,7 @@ class Daemon:
         assemble.warm_up(config)
         starting()
         self._fusion = RecordedFusion(
-            assemble.parts(
-                config, self._sensors, maps, OdometryOnly() if start_pose is None else OdometryOnly(start_pose)
-            )
+            assemble.parts(config, self._sensors, maps, assemble.localiser(config, start_pose or IDENTITY))
         )
         self._building = maps.building
         self._fusion.recorder = self._recorder
@@ -222,22 +219,16 @@ class Daemon:
 
     def _on_record_start(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Begin a recording on request; every device is set up anew, so that its set-up is in it."""
-        folder, published = arguments.get("folder"), arguments.get("published")
-        if not isinstance(folder, str | None) or not isinstance(published, bool | None):
-            raise CallRefused('"folder" must be a path, "published" true or false')
-        if folder is not None and not Path(folder).is_absolute():
-            raise CallRefused(f'"folder" must be an absolute path, not {folder}')
+        published = arguments.get("published")
+        if not isinstance(published, bool | None):
+            raise CallRefused('"published" must be true or false')
         pose = self._worker.ask(lambda: self._fusion.pose()) or IDENTITY
-        path = self._begin_recording(
-            pose, complete=False, folder=None if folder is None else Path(folder), published=published
-        )
+        path = self._begin_recording(pose, complete=False, published=published)
         for reader in self._readers:
             reader.start_anew()
         return {"file": str(path)}
 
-    def _begin_recording(
-        self, map_from_odom: Pose2, *, complete: bool, folder: Path | None = None, published: bool | None = None
-    ) -> Path:
+    def _begin_recording(self, map_from_odom: Pose2, *, complete: bool, published: bool | None = None) -> Path:
         building = self._building
         tiles = () if building is None else tuple(self._worker.ask(lambda: list(building.grid.tiles())))
         start = recording.Start(
@@ -249,7 +240,7 @@ class Daemon:
             complete,
             tiles,
         )
-        path = self._recorder.begin(start, folder=folder, published=published)
+        path = self._recorder.begin(start, published=published)
         log.info("recording to %s", path)
         return path
 

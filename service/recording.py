@@ -25,7 +25,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -208,14 +208,12 @@ class Recorder:
         """Whether something is being recorded."""
         return self._active
 
-    def begin(self, start: Start, *, folder: Path | None = None, published: bool | None = None) -> Path:
+    def begin(self, start: Start, *, published: bool | None = None) -> Path:
         """Start a new run; returns its first file. Trouble if it cannot be written, or one is being recorded."""
         with self._lock:
             if self._active:
                 raise Trouble("a recording is under way; end it first (`umfeld record --stop`)")
             settings = self._settings
-            if folder is not None:
-                settings = replace(settings, folder=folder)
             self._published = settings.published if published is None else published
             offset_ns = self._clock.wall_from_monotonic_ns(0)
             from service.recording_files import Files  # here: who does not record needs none of its libraries

@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 _SYNC_PERIOD_S = 1.0
 _RETRY_PERIOD_S = 5.0
-_NAME = re.compile(r"(?P<run>.+)-(?P<number>\d{4,})\.mcap\Z")
+_NAME = re.compile(r"(?P<run>.+-\d{8}T\d{6}Z(?:-\d+x)?)-(?P<number>\d{4,})\.mcap\Z")  # nobody else's, for make_room
 
 
 class _Writer(McapWriter):

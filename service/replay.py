@@ -27,9 +27,10 @@ from mapping.frames import Pose2
 from mapping.grids.occupancy import OccupancyGrid
 from service import assemble
 from service.clock import CrankedClock
-from service.config import Config
+from service.config import Config, check
+from service.config_files import Layers
 from service.errors import Trouble
-from service.fusion import TICK_PERIOD_NS, Fusion, OdometryOnly
+from service.fusion import TICK_PERIOD_NS, Fusion
 from service.outputs import Output, PoseOut
 from service.recording import (
     END,
@@ -284,8 +285,8 @@ class Replay:
         maps = assemble.maps(self.config, found)
         self._building = maps.building
         self._load_map()
-        start_pose = Pose2(*self.head.start.pose)
-        self.fusion = Fusion(assemble.parts(self.config, found, maps, OdometryOnly(start_pose)))
+        localiser = assemble.localiser(self.config, Pose2(*self.head.start.pose))
+        self.fusion = Fusion(assemble.parts(self.config, found, maps, localiser))
         self._waiting: dict[str, deque[Reading | DeviceEvent]] = {}
         self._next_tick_ns = self.head.begun_ns
         self._unknown_wires: set[str] = set()
@@ -447,8 +448,8 @@ def _ignore(_: object) -> None:
 def config_of(head: Head) -> Config:
     """The configuration that was recorded. Trouble if this version does not know it any more."""
     try:
-        return Config.model_validate_json(head.start.config)
-    except ValueError as error:
+        return check(Layers(json.loads(head.start.config), {}, {}, ()))
+    except (ValueError, Trouble) as error:
         raise Trouble(
             f"the configuration in this recording (version {head.start.version}) is not valid here: {error}; give one "
             "with --config"

@@ -21,7 +21,7 @@ app = typer.Typer()
 @app.command()
 def record(
     *,
-    out: Annotated[Path | None, typer.Option(help="Folder for the recording; default: [recording] folder.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the recording; default: that of [recording].")] = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="End after so long; 0: when interrupted.")] = 0.0,
     raw_only: Annotated[bool, typer.Option("--raw-only", help="Only what replay needs, nothing published.")] = False,
     detach: Annotated[bool, typer.Option("--detach", help="Start recording in the daemon and return.")] = False,
@@ -57,8 +57,9 @@ def record(
         if stop:
             _report(client.call(base, "record_stop", timeout_s=20.0), as_json)
             return
-        arguments = {"folder": None if out is None else str(out.absolute()), "published": False if raw_only else None}
-        begun = client.call(base, "record_start", arguments, timeout_s=20.0)
+        if detach and out is not None:
+            raise WrongUsage("--detach leaves the files with the daemon, in [recording] folder; leave --out away")
+        begun = client.call(base, "record_start", {"published": False if raw_only else None}, timeout_s=20.0)
         if detach:
             _report(begun, as_json)
             return
@@ -67,7 +68,8 @@ def record(
             _wait(client, base, seconds)
         except KeyboardInterrupt:
             typer.echo("", err=True)
-        _report(client.call(base, "record_stop", timeout_s=20.0), as_json)
+        done = client.call(base, "record_stop", timeout_s=20.0)
+        _report(done if out is None else {**done, "files": _fetched(done["files"], out)}, as_json)
 
 
 def _client(connect: str | None, config: Path | None) -> Client | None:
@@ -96,6 +98,20 @@ def _wait(client: Client, base: str, seconds: float) -> None:
         if status["trouble"] != told and status["trouble"] is not None:
             typer.secho(status["trouble"], fg="red", err=True)
         told = status["trouble"]
+
+
+def _fetched(files: list[str], out: Path) -> list[str]:
+    """Copies of the daemon's files in a folder of the user's; the daemon writes only where it was told to."""
+    import shutil
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        return [str(shutil.copy2(file, out)) for file in files]
+    except OSError as error:
+        raise Trouble(
+            f"{out}: {error.strerror or error}: the recording could not be copied there; it is whole in "
+            f"{', '.join(files)} (they belong to the daemon's user)"
+        ) from error
 
 
 def _run_recording(config: Path | None, settings: list[str], out: Path | None, seconds: float, raw_only: bool) -> None:

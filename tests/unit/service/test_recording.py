@@ -153,8 +153,9 @@ def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
 def test_disk_space_is_bounded_and_the_first_file_stays(tmp_path: Path) -> None:
     old = tmp_path / "artos-20200101T000000Z-0000.mcap"
     old.write_bytes(bytes(50_000))
-    stranger = tmp_path / "holiday.mcap"
-    stranger.write_bytes(bytes(10))
+    strangers = [tmp_path / "holiday.mcap", tmp_path / "their-bag-0001.mcap"]
+    for stranger in strangers:
+        stranger.write_bytes(bytes(10))
     desk = Desk(tmp_path)
     first = desk.begin()
     said: list[bytes] = []
@@ -167,7 +168,7 @@ def test_disk_space_is_bounded_and_the_first_file_stays(tmp_path: Path) -> None:
     files = recording_files.files_of_run(tmp_path, first.name.removesuffix("-0000.mcap"))
     assert files[0] == first
     assert not old.exists()
-    assert stranger.exists()
+    assert all(stranger.exists() for stranger in strangers)
     assert 3 <= len(files) <= 6
     entries = list(Recording.of(first).entries())
     assert sum(isinstance(entry, Lost) for entry in entries) == 1, "the gap in the middle is told"
