@@ -103,9 +103,7 @@ def run(folder: Path) -> None:
                 axes[1].fill(*closed.T, color="C2", alpha=0.3)
             case OutlineKind.OPEN:
                 axes[1].plot(*outline.points_m.T, "-", color="0.5", lw=1)
-    axes[1].set_title(
-        "S08: outlines elsewhere; blue: obstacles (counter-clockwise), green: rooms (clockwise)"
-    )
+    axes[1].set_title("S08: outlines elsewhere; blue: obstacles (counter-clockwise), green: rooms (clockwise)")
     for each in axes:
         finish(each)
     save(figure, folder / "lines_map.png")
