@@ -151,8 +151,10 @@ def cola_stream(rng: Rng) -> list[bytes]:
 def read_cola(data: bytes) -> list[Key]:
     found: list[Key] = []
     for each in cola.TelegramReader().feed(data, 0):
-        if each.scan is not None and each.scan.serial == 18480390 and not each.scan.tail_is_odd:
-            found.append(each.payload)
+        scan = each.scan
+        if scan is not None and scan.serial == 18480390 and not scan.tail_is_odd:
+            rows = [(name, row.raw.tobytes(), row.first_deg, row.step_deg) for name, row in scan.channels.items()]
+            found.append((scan.status, scan.scan_us, scan.sent_us, scan.scans_per_s, rows))
     return found
 
 
