@@ -535,6 +535,8 @@ class Slam:
         if self._outstanding is not None:
             self.apply(self._outstanding.run())
         n = len(self._views)
+        if n < 2:
+            return
         while self._looked_at < n:
             keys = tuple(range(self._looked_at, min(n, self._looked_at + 50)))
             self._looked_at = keys[-1] + 1
