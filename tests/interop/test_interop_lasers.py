@@ -1,0 +1,225 @@
+"""Other people's laser drivers on the emulated lasers, over ptys and TCP, held against the room they stand in.
+
+Packages: pyrplidarsdk (the maker's SDK), rplidar-roboticia, pyrplidar, lds2d. Programs, if they are on the PATH:
+lms2xx_simple_app (sicktoolbox), ldlidar_stl_node (ldlidar_stl_sdk), sick_generic_caller (sick_scan_xd, built without
+ROS; its launch files in the folder named by SICK_SCAN_LAUNCH).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import itertools
+import json
+import os
+import re
+import select
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import serial
+
+from sim_devices.attach import Attachment, PtyLink, TcpLink
+from sim_devices.device import F64, ByteDevice, Mount
+from sim_devices.laser_ldrobot import LdLidar
+from sim_devices.laser_rplidar import RPLIDAR_PROFILES, RpLidar
+from sim_devices.laser_sick_cola import SickColaLaser
+from sim_devices.laser_sick_lms2xx import SickLms2xxLaser
+
+NOISE_M = (
+    0.02  # mean error of a reader that reads right: the lasers' noise, and angles rounded to an eighth of a degree
+)
+
+
+class Room:
+    """Walls 3 m ahead, 4 m behind, 2 m to the left and 1 m to the right."""
+
+    def beam_ranges(self, mount: Mount, bearing_rad: F64, stamp_ns: F64, range_max_m: float) -> F64:
+        c, s = np.cos(bearing_rad), np.sin(bearing_rad)
+        with np.errstate(divide="ignore"):
+            along = np.where(c > 0, 3.0, 4.0) / np.abs(c)
+            across = np.where(s > 0, 2.0, 1.0) / np.abs(s)
+        return np.minimum(along, across)
+
+    def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
+        return 1.0
+
+    def wheel_travel_m(self, now_ns: int) -> tuple[float, float]:
+        return 0.0, 0.0
+
+
+def needs(package: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(importlib.util.find_spec(package) is None, reason=f"needs {package}")
+
+
+def needs_program(name: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(shutil.which(name) is None, reason=f"needs {name} on the PATH")
+
+
+@contextlib.contextmanager
+def on_a_pty(device: ByteDevice, path: Path) -> Iterator[str]:
+    loop = Attachment()
+    loop.add("laser", device, PtyLink(path))
+    with loop:
+        time.sleep(1.6)  # the device boots and spins up before anybody asks, as on a desk
+        yield str(path)
+
+
+def mean_error_m(clockwise_deg: list[float], range_m: list[float]) -> float:
+    """Of what a reader read, against the room."""
+    got = np.array([(angle, r) for angle, r in zip(clockwise_deg, range_m) if r > 0.0])
+    assert len(got) > 100
+    true_m = Room().beam_ranges(Mount(), -np.radians(got[:, 0]), np.zeros(len(got)), 12.0)
+    return float(np.abs(got[:, 1] - true_m).mean())
+
+
+@pytest.fixture
+def no_modem_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pty has no DTR; drivers that insist on it believe it was set."""
+    monkeypatch.setattr(serial.Serial, "_update_dtr_state", lambda self: None)
+
+
+# -- RPLIDAR -----------------------------------------------------------------------------------------------------------
+
+
+SDK_PROGRAM = """
+import json, sys, time
+from pyrplidarsdk import RplidarDriver
+reader = RplidarDriver(port=sys.argv[1], baudrate=115200)
+assert reader.connect()
+info, health = reader.get_device_info(), reader.get_health()
+assert reader.start_scan()
+turns, end = [], time.monotonic() + 8.0
+while len(turns) < 15 and time.monotonic() < end:  # the first ones while the motor gets up to speed
+    turn = reader.get_scan_data()
+    if turn is not None:
+        turns.append(turn)
+reader.stop_scan()
+reader.disconnect()
+print(json.dumps([info.model, repr(health), list(turns[-1][0]), list(turns[-1][1])]))
+"""
+
+
+@needs("pyrplidarsdk")
+@pytest.mark.parametrize("model", ["a1", "a2"])
+@pytest.mark.parametrize("firmware", [(1, 29), (1, 20)])
+def test_makers_sdk_reads_turns(model: str, firmware: tuple[int, int], tmp_path: Path) -> None:
+    """In a process of its own: it keeps the interpreter to itself while it waits."""
+    told = RPLIDAR_PROFILES[model]
+    with on_a_pty(RpLidar(Room(), profile=told, firmware=firmware), tmp_path / "laser") as port:
+        program = [sys.executable, "-c", SDK_PROGRAM, port]
+        out = subprocess.run(program, capture_output=True, text=True, timeout=30.0, check=True).stdout
+    device, health, angle_rad, range_m = json.loads(out.splitlines()[-1])
+    assert device == told.model
+    assert "OK" in health
+    assert len(angle_rad) == pytest.approx(4000 / told.turns_per_s, rel=0.05)
+    assert mean_error_m(list(np.degrees(angle_rad)), range_m) < NOISE_M
+
+
+@needs("rplidar")
+@pytest.mark.usefixtures("no_modem_lines")
+def test_roboticia_reads_standard_turns(tmp_path: Path) -> None:
+    with on_a_pty(RpLidar(Room()), tmp_path / "laser") as port:
+        reader = importlib.import_module("rplidar").RPLidar(port)
+        try:
+            assert reader.get_info()["firmware"] == (1, 29)
+            assert reader.get_health() == ("Good", 0)
+            turns = list(itertools.islice(reader.iter_scans(), 4))
+            _, angles, ranges_mm = zip(*turns[-1])
+            assert len(angles) == pytest.approx(2000 / 7, rel=0.05)
+            assert mean_error_m(list(angles), [r * 1e-3 for r in ranges_mm]) < NOISE_M
+        finally:
+            reader.stop()
+            reader.disconnect()
+
+
+@needs("pyrplidar")
+@pytest.mark.usefixtures("no_modem_lines")
+def test_pyrplidar_reads_all_kinds_of_scans(tmp_path: Path) -> None:
+    with on_a_pty(RpLidar(Room()), tmp_path / "laser") as port:
+        reader = importlib.import_module("pyrplidar").PyRPlidar()
+        reader.connect(port=port, baudrate=115200, timeout=3)
+        assert [mode.name for mode in reader.get_scan_modes()] == ["Standard", "Express"]
+        for begin in (reader.force_scan, reader.start_scan, lambda: reader.start_scan_express(0)):
+            got = list(itertools.islice(begin()(), 1000))
+            assert mean_error_m([s.angle for s in got], [s.distance * 1e-3 for s in got]) < NOISE_M
+            reader.stop()
+            time.sleep(0.3)
+            reader.lidar_serial._serial.reset_input_buffer()
+        reader.disconnect()
+
+
+@needs("lds2d")
+@pytest.mark.parametrize(("model", "device", "points"), [("LD06", LdLidar, 450), ("RPLIDAR-A1", RpLidar, 286)])
+def test_lds2d_reads_turns(model: str, device: Any, points: int, tmp_path: Path) -> None:
+    with (
+        on_a_pty(device(Room()), tmp_path / "laser") as port,
+        importlib.import_module("lds2d").Lidar.open(model, port) as reader,
+    ):
+        turn = list(itertools.islice(reader.scans(), 4))[-1]
+        assert len(turn) == pytest.approx(points, rel=0.05)
+        assert mean_error_m([p.angle_deg for p in turn], [p.dist_mm * 1e-3 for p in turn]) < NOISE_M
+
+
+# -- programs ----------------------------------------------------------------------------------------------------------
+
+
+def heard(command: list[str], until: str, limit_s: float) -> str:
+    """Runs a program until a line of its output has come often enough, or time is up; returns its output."""
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    assert program.stdout is not None
+    out, end = "", time.monotonic() + limit_s
+    try:
+        while time.monotonic() < end and len(re.findall(until, out)) < 5:
+            if select.select([program.stdout], [], [], 0.1)[0]:
+                data = os.read(program.stdout.fileno(), 65536)
+                if not data:
+                    break
+                out += data.decode("utf-8", errors="replace")
+    finally:
+        program.kill()
+        program.wait()
+        program.stdout.close()
+    return out
+
+
+@needs_program("lms2xx_simple_app")
+def test_sicktoolbox_starts_and_reads_an_lms200(tmp_path: Path) -> None:
+    with on_a_pty(SickLms2xxLaser(Room()), tmp_path / "laser") as port:
+        out = heard(["lms2xx_simple_app", port, "38400"], r"Num\. Values: 361", 30.0)
+    assert "Sick LMS 200-30106" in out
+    assert out.count("Num. Values: 361") >= 5
+
+
+@needs_program("ldlidar_stl_node")
+def test_makers_sdk_reads_an_ld06(tmp_path: Path) -> None:
+    with on_a_pty(LdLidar(Room()), tmp_path / "laser") as port:
+        out = heard(["ldlidar_stl_node", "LD06", "serialcom", port], r"size:4[45]\d", 15.0)
+    sizes = [int(size) for size in re.findall(r"size:(\d+)", out)]
+    assert len(sizes) >= 5
+    assert all(size == pytest.approx(450, abs=12) for size in sizes[1:])
+
+
+@needs_program("sick_generic_caller")
+@pytest.mark.skipif(not os.environ.get("SICK_SCAN_LAUNCH"), reason="needs SICK_SCAN_LAUNCH")
+def test_makers_driver_starts_a_tim() -> None:
+    laser, link = SickColaLaser(Room()), TcpLink(0)
+    loop = Attachment()
+    loop.add("laser", laser, link)
+    launch = Path(os.environ["SICK_SCAN_LAUNCH"]) / "sick_tim_5xx.launch"
+    with loop:
+        time.sleep(1.5)
+        command = ["sick_generic_caller", str(launch), "hostname:=127.0.0.1", f"port:={link.port}"]
+        out = heard(command, "packets dropped. Software PLL not yet locked", 20.0)
+    assert "Angle resolution of scanner is 0.3333" in out
+    assert "sEA LMDscandata" in out
+    assert "sFA" not in out
+    assert link.counters.sent_bytes > 5 * 3374

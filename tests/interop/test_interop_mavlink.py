@@ -1,0 +1,77 @@
+"""pymavlink's own connections, on which most ground tools stand, on the emulated autopilot."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim_devices.attach import Attachment, PtyLink
+from sim_devices.device import F64, Mount
+from sim_devices.mavlink_autopilot import MavlinkAutopilot, Rangefinder
+from sim_devices.udp_link import UdpLink
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("pymavlink") is None, reason="needs pymavlink")
+
+
+class Rolling:
+    """Wheels at half a metre a second, a wall a metre away."""
+
+    def beam_ranges(self, mount: Mount, bearing_rad: F64, stamp_ns: F64, range_max_m: float) -> F64:
+        return np.ones(len(bearing_rad))
+
+    def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
+        return 1.0
+
+    def wheel_travel_m(self, now_ns: int) -> tuple[float, float]:
+        return 0.5e-9 * now_ns, 0.5e-9 * now_ns
+
+
+@pytest.fixture(params=["pty", "udpin", "udpout"])
+def meeting(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[MavlinkAutopilot, Any]]:
+    """An autopilot and a connection to it: on a serial line, as one who listens, as one who calls."""
+    os.environ["MAVLINK20"] = "1"  # read when mavutil is imported
+    from pymavlink import mavutil
+
+    on_udp = request.param != "pty"
+    pilot = MavlinkAutopilot(Rolling(), line_rate_bps=None if on_udp else 57600, rangefinders=[Rangefinder(0, Mount())])
+    link: PtyLink | UdpLink
+    identity = {"source_system": 1, "source_component": 196, "dialect": "common"}
+    if request.param == "pty":
+        link = PtyLink(tmp_path / "pilot")
+        host = mavutil.mavlink_connection(str(tmp_path / "pilot"), baud=57600, **identity)
+    elif request.param == "udpin":
+        host = mavutil.mavlink_connection("udpin:127.0.0.1:0", **identity)
+        link = UdpLink(host.port.getsockname()[1])
+    else:
+        link = UdpLink()
+        host = mavutil.mavlink_connection(f"udpout:127.0.0.1:{link.port}", **identity)
+    loop = Attachment()
+    loop.add("pilot", pilot, link)
+    with loop:
+        host.mav.heartbeat_send(18, 8, 0, 0, 4)
+        yield pilot, host
+        host.close()
+
+
+def test_messages_flow_both_ways(meeting: tuple[MavlinkAutopilot, Any]) -> None:
+    pilot, host = meeting
+    assert host.recv_match(type="HEARTBEAT", blocking=True, timeout=5).autopilot == 3
+    for _ in range(3):
+        host.mav.heartbeat_send(18, 8, 0, 0, 4)
+        host.mav.obstacle_distance_send(0, 0, [100] + [401] * 71, 5, 20, 400, 5.0, 0.0, 12)
+        time.sleep(0.1)
+    first = host.recv_match(type="WHEEL_DISTANCE", blocking=True, timeout=5)
+    odometry = host.recv_match(type="ODOMETRY", blocking=True, timeout=5)
+    near = host.recv_match(type="DISTANCE_SENSOR", blocking=True, timeout=5)
+    assert first.count == 2
+    assert odometry.vx == pytest.approx(0.5, abs=0.01)
+    assert near.current_distance == 100
+    assert pilot.companion_ns is not None
+    assert (pilot.accepted, pilot.refused) == (3, 0)
