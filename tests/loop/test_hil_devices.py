@@ -30,7 +30,7 @@ from service.config import Config, load
 from service.fusion import Fusion, OdometryOnly
 from service.outputs import HealthOut, OdomOut, Output, PolarOut
 from service.worker import Worker
-from sim_devices.attach import Attachment, PtyLink
+from sim_devices.attach import Attachment, Link, PtyLink
 from sim_devices.device import F64, Frame, Mount
 from sim_devices.faults import Fault, FaultPlan
 from sim_devices.laser_hokuyo import PROFILES
@@ -114,7 +114,7 @@ class Rig:
         self.kind = self.device.partition("-")[0]
         self.is_real = self.kind in self.hardware
         self.bridges: list[SerialBridge | CanBridge] = []
-        self.links: list[PtyLink] = []
+        self.links: list[Link] = []
         self.plan = FaultPlan(seed=7)
         self.attachment = Attachment()
         table = self._attach(config_for(self.kind, self.hardware.get(self.kind)))
