@@ -514,7 +514,11 @@ class _Source(Generic[WireT]):
         self._sink(self.name, DeviceEvent(now_ns, state, text, news[2]))
         good = state in (LinkState.STARTING, LinkState.RUNNING) or text == _WORDS[LinkState.SILENT]
         level = logging.INFO if good else logging.WARNING
-        self._log.say(now_ns, f"{self.name}: {state.name}", level, f"{self.name}: {state.name.lower()}: {text}")
+        is_said = self._log.say(
+            now_ns, f"{self.name}: {state.name}", level, f"{self.name}: {state.name.lower()}: {text}"
+        )
+        if is_said and not good:  # whoever reads of the trouble reads of its end, too
+            self._log.forget(f"{self.name}: {LinkState.RUNNING.name}")
 
 
 _WORDS = {
@@ -585,10 +589,15 @@ class _RateLimitedLog:
     def __init__(self) -> None:
         self._last: dict[str, tuple[int, int]] = {}  # cause -> (when told, kept back since)
 
-    def say(self, now_ns: int, cause: str, level: int, text: str) -> None:
+    def say(self, now_ns: int, cause: str, level: int, text: str) -> bool:
         kept_back = self._due(now_ns, cause)
         if kept_back is not None:
             log.log(level, "%s%s", text, f" (and {kept_back} times more since last told)" if kept_back else "")
+        return kept_back is not None
+
+    def forget(self, cause: str) -> None:
+        """The next line of this cause is told at once."""
+        self._last.pop(cause, None)
 
     def exception(self, now_ns: int, cause: str, text: str, *args: object) -> None:
         if self._due(now_ns, cause) is not None:
