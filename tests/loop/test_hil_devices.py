@@ -373,11 +373,11 @@ def enough(rig: Rig) -> int:
 # --- bytes -----------------------------------------------------------------------------------------------------------
 
 # Pieces small enough to cut every message, and bursts of several: as many as a pty holds for a laser, as few as keep
-# an encoder's answer within the period of its SYNC.
+# an encoder's answer within the period of its SYNC and a board's within the patience of its driver.
 SPLITS = {
     "laser-urg": ["short_reads=80", "bursts=0.06"],
     "laser-utm": ["short_reads=400", "bursts=0.06"],
-    "sonars": ["short_reads=30", "bursts=0.1"],
+    "sonars": ["short_reads=30", "bursts=0.03"],
     "wheels": ["short_reads=30", "bursts=0.005"],
 }
 # Chances that damage some replies and leave some whole: a UTM's scan has 3370 bytes, an slcan line 27. The sum in SCIP
