@@ -48,6 +48,8 @@ class _Merge:
 def find_config(given: Path | None, *, home: Path | None = None, here: Path | None = None) -> Path | None:
     """The configuration file to use, or None for defaults only. Raises WrongUsage if a given file is not there."""
     if given is not None:
+        if given.is_dir():
+            raise WrongUsage(f"{given}: is a folder; name the file in it, e.g. {given / 'umfeld.toml'}")
         if not given.is_file():
             raise WrongUsage(f"{given}: no such configuration file; write one with `umfeld config init {given}`")
         return given

@@ -15,6 +15,7 @@ import contextlib
 import faulthandler
 import hashlib
 import logging
+import math
 import os
 import select
 import signal
@@ -119,11 +120,18 @@ class Daemon:
         store = self._open_store()
         maps = assemble.maps(config, self._sensors)
         start_pose = None if store is None or maps.building is None else restore(maps.building.grid, store)
+        if start_pose is not None and store is not None and store.layers().get("grid"):
+            log.warning(
+                "the map goes on where it was left, with the robot at x %.2f m y %.2f m yaw %.0f deg: "
+                "if it was moved since, start with another [store] path or load a map",
+                start_pose.x_m, start_pose.y_m, math.degrees(start_pose.yaw_rad),
+            )  # fmt: skip
         self._publisher = self._make_publisher()
         self._parts.callback(self._close_publisher)
         self._publisher.add_tap(self._recorder.message)
         starting = _in_thread("router", self._publisher.start)  # takes half a second, the kernels as much
-        assemble.warm_up(config)
+        with _told_if_slow("compiling the kernels, as after each update: some 20 s"):
+            assemble.warm_up(config)
         starting()
         self._fusion = RecordedFusion(
             assemble.parts(config, self._sensors, maps, assemble.localiser(config, start_pose or IDENTITY))
@@ -267,10 +275,10 @@ class Daemon:
 
     def _summary(self) -> str:
         config = self._config
-        return (
-            f"robots/{config.robot.id} on {', '.join(config.network.listen)}: "
-            f"{len(self._sensors)} devices on {len(self._readers)} wires"
-        )
+        where = f"robots/{config.robot.id} on {', '.join(config.network.listen)}"
+        if not self._sensors:
+            return f"{where}: no device is configured; add [lasers.NAME], [sonars.NAME] or [wheels.NAME]"
+        return f"{where}: {len(self._sensors)} devices on {len(self._readers)} wires"
 
     def _wall_ns(self) -> int:
         return self._clock.wall_from_monotonic_ns(self._clock.now_ns())
@@ -437,6 +445,18 @@ class _StopSignals:
         self._count += 1
         if self._count > 1:
             os._exit(128 + number)
+
+
+@contextlib.contextmanager
+def _told_if_slow(text: str, after_s: float = 2.0) -> Iterator[None]:
+    """One log line if what is done takes long."""
+    timer = threading.Timer(after_s, log.info, (text,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 @contextlib.contextmanager

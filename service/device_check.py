@@ -139,12 +139,14 @@ def _address_problem(endpoint: str) -> str | None:
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
     if protocol not in ("tcp", "tls", "ws") or not port.isdecimal():
         return None
+    if int(port) > 65535:
+        return f"[network] listen: {endpoint} has no such port; ports are 1 to 65535"
     host = host.strip("[]")
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, int(port)))
-        except (OSError, OverflowError) as error:
+        except OSError as error:
             return (
                 f"[network] listen: {endpoint} cannot be used ({error}); stop the daemon or router that has it "
                 "(`ss -ltnp` names it), or set another port"
