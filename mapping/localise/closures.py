@@ -51,7 +51,8 @@ class ClosureSettings:
     the sum of both, at most search_m.  tracked_m: up to this drift no search is needed.  turn_rad_per_m: heading drift.
     place_m: key scans on either side along the way that make up a place.  every_m: a place is searched for so
     often, at most `searches` times in one piece of work.  score, rival: of a search, see Found.
-    explained, refuted: shares of the points, see Agreement.  weakest_per_m2: least information in the worst direction.
+    explained, overlap, mean_cost: of the points, see Agreement and Match; half_*: what still has half a vote (leaves,
+    lawns and crowds fit nowhere well).  weakest_per_m2: least information in the worst direction.
     agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way.
     pending: how many closures wait at most.  undone_below: the weight under which a closure is forgotten in the end.
     floor_*: errors of a match that no matcher sees.  misfit: median squared distance of new closures from the map that
@@ -75,6 +76,9 @@ class ClosureSettings:
     explained: float = 0.55
     overlap: float = 0.93
     mean_cost: float = 0.30
+    half_explained: float = 0.50
+    half_overlap: float = 0.88
+    half_mean_cost: float = 0.42
     weakest_per_m2: float = 1000.0
     agreeing: int = 3
     agreeing_way_m: float = 1.2
@@ -90,15 +94,15 @@ class ClosureSettings:
 class Closure:
     """Key `to` seen from key `start`, an earlier one.
 
-    information: (3, 3) in the frame of start.  searched: found by search, not from the estimate.
-    number: its name, for undoing; -1 until it is accepted.
+    information: (3, 3) in the frame of start.  worth: its vote on probation.  searched: found by search,
+    not from the estimate.  number: its name, for undoing; -1 until it is accepted.
     """
 
     start: int
     to: int
     measured: Pose2
     information: F64
-    explained: float
+    worth: float
     searched: bool
     number: int = -1
 
@@ -333,7 +337,13 @@ class Work:
             self._events["ran_away"] += 1
             return None
         agrees = agreement(shot.views.view(key), shot.views, rows, shot.poses[rows], match.pose)
-        if agrees.explained < s.explained or agrees.overlap < s.overlap or match.mean_cost > s.mean_cost:
+        fits = agrees.explained >= s.explained and agrees.overlap >= s.overlap and match.mean_cost <= s.mean_cost
+        if not fits and not (
+            searched
+            and agrees.explained >= s.half_explained
+            and agrees.overlap >= s.half_overlap
+            and match.mean_cost <= s.half_mean_cost
+        ):
             self._events["does_not_fit"] += 1
             return None
         information = match.information()
@@ -342,7 +352,7 @@ class Work:
             return None
         start = Pose2(*shot.poses[place].tolist())
         seen = floored(turned_information(information, -start.yaw_rad), s.floor_m, s.floor_rad)
-        return Closure(place, key, start.inverse() @ match.pose, seen, agrees.explained, searched)
+        return Closure(place, key, start.inverse() @ match.pose, seen, 1.0 if fits else 0.5, searched)
 
     # --- probation
 
@@ -350,14 +360,15 @@ class Work:
         """The largest group of pending closures that ask for one correction, if it is enough, and the rest."""
         s, travel = self.settings, self.snapshot.travel_m
         best: list[int] = []
+        votes = 0.0
         for first in pending:
             group = [k for k, other in enumerate(pending) if self._same_correction(first, other)]
-            if len(group) > len(best):
-                best = group
-        keys = {pending[k].to for k in best}
-        if len(keys) < s.agreeing:
+            worth = {pending[k].to: pending[k].worth for k in group}  # a key scan has one vote
+            if sum(worth.values()) > votes:
+                best, votes = group, sum(worth.values())
+        if votes < s.agreeing:
             return [], pending
-        way = [float(travel[k]) for k in keys]
+        way = [float(travel[pending[k].to]) for k in best]
         if max(way) - min(way) < s.agreeing_way_m:
             return [], pending
         chosen = set(best)

@@ -58,6 +58,8 @@ UNMATCHED_PATIENCE = 4.0  # a sweep that fits nothing may be dust, a crowd or a 
 VELOCITY_OVER_S = 0.15
 FASTEST_M_S = 20.0
 FASTEST_RAD_S = 4.0
+FINISHING_PASSES = 4
+WORTH_ANOTHER_PASS = 3  # closures gained in one
 CLEARLY = 1.1  # times better a match must be to be believed against the prediction
 
 
@@ -75,7 +77,7 @@ class SlamSettings:
 
     key_m: float = 0.3
     key_rad: float = math.radians(12.0)
-    references: int = 12
+    references: int = 8
     near_m: float = 6.0
     farthest_m: float = 30.0
     odometry_m: float = 0.004
@@ -330,7 +332,9 @@ class Slam:
         doubt = 0.5 if match is None else min(match.mean_cost, 0.7)
         pull = guess.information() / (1.0 - doubt) ** 4  # leaves that move and crowds look like many points
         held = match_view(view, store, rows, poses, guess.map_from_sensor, prior=pull, reach=NEARBY)
-        best = match if held is None or (match is not None and match.score > CLEARLY * held.score) else held
+        best = held
+        if match is not None and (held is None or match.score > CLEARLY * held.score):
+            best = match
         fits = 0.0 if best is None else agreement(view, store, rows, poses, best.pose).explained
         if fits < 0.5:
             best, fits = self._looked_around(view, rows, guess, best, fits)
@@ -542,12 +546,23 @@ class Slam:
             self._looked_at = keys[-1] + 1
             self._do(self._snapshot(keys))
         self._do(self._snapshot((), thorough=True))
-        for first in range(0, n, 100):
+        for done in range(FINISHING_PASSES):  # each may bring others within reach
+            before = len(self.closures)
+            self._look_again(done * n, FINISHING_PASSES * n, progress)
+            if len(self.closures) < before + WORTH_ANOTHER_PASS:
+                break
+
+    def _look_again(self, done: int, total: int, progress: Progress | None) -> None:
+        """Look for closures of the key scans that have none, then let the graph settle: a loop that was closed
+        late brings others within reach."""
+        n = len(self._views)
+        for first in range(0, n, 40):
             closed = {c.to for c in self.closures}
-            keys = tuple(k for k in range(first, min(n, first + 100)) if k not in closed)
-            self._do(self._snapshot(keys))
+            keys = tuple(k for k in range(first, min(n, first + 40)) if k not in closed)
+            if keys:
+                self._do(self._snapshot(keys))
             if progress is not None:
-                progress(min(n, first + 100), n)
+                progress(done + min(n, first + 40), total)
         self._do(self._snapshot((), thorough=True))
 
     def _do(self, snapshot: Snapshot) -> None:
