@@ -18,6 +18,7 @@ readings in order of their channels ("R0480 R1234"). Sensors on it that are not 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, radians
@@ -133,7 +134,7 @@ def _swap(first: _Ear, second: _Ear) -> Undo:
     return undo
 
 
-class _Talker:
+class _Talker(ABC):
     """What both devices share: a quarter of a second of silence, a banner, then lines for ever."""
 
     fault_family = "sonar"
@@ -176,11 +177,13 @@ class _Talker:
         """See wheel.Faulty."""
         return _inflict(self._ears, kind, value, arguments)
 
+    @abstractmethod
     def _first_ns(self) -> int:
-        raise NotImplementedError
+        """From the greeting's end to the first line."""
 
+    @abstractmethod
     def _say_next(self, now_ns: int) -> None:
-        raise NotImplementedError
+        """Send the next line."""
 
 
 class MaxBotix(_Talker):
