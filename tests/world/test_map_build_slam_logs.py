@@ -96,13 +96,14 @@ def test_the_same_log_gives_the_same_bytes() -> None:
 @needs_data
 @pytest.mark.parametrize("name", ["encoder_laser/exp1.dat.gz", "wean_localisation/robotdata1.log.gz"])
 def test_other_robots_logs_follow_their_odometry_at_first(name: str) -> None:
-    """Wheels do not lie much over 20 scans, whatever the laser."""
+    """Wheels do not lie much over 20 scans (2 s), whatever the laser: a tenth of the way, and two scans of delay at
+    full speed, since ticks and sweeps share a row of these logs but not a moment."""
     log = read_log(Path(DATA) / name)
     poses = run_slam(log, log.scans[:200]).robot_poses
     wheels = np.array([scan.robot_pose for scan in log.scans[:200]])
     by_slam = np.hypot(*(poses[20:, :2] - poses[:-20, :2]).T)
     by_wheels = np.hypot(*(wheels[20:, :2] - wheels[:-20, :2]).T)
-    assert np.abs(by_slam - by_wheels).max() < 0.05 + 0.1 * by_wheels.max()
+    assert np.abs(by_slam - by_wheels).max() < (0.1 + 2.0 / 20.0) * by_wheels.max()
 
 
 def test_the_worst_second_is_the_slowest_stretch_of_a_second() -> None:
