@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from drivers.encoder_arduino_bridge import ArduinoBridgeConversation
     from drivers.mavlink_in import MavlinkConversation
     from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
+    from service.map_makers import MapMaker
     from service.mavlink_out import MavlinkOut
 
 
@@ -444,6 +445,20 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
     if config.artos.enabled:
         grids.append(_artos_map(config, [layer for layer in sectors if isinstance(layer, PolarLayer)]))
     return Maps(sectors, tuple(grids), building)
+
+
+def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
+    """The maps that are made on the slow thread."""
+    makers: list[MapMaker] = []
+    lasers = frozenset(name for name, sensor in found.items() if isinstance(sensor, Laser))
+    if config.lines.enabled and (fed_by := lasers & _sources(config, config.lines.sources, found)):
+        from mapping.lines.line_map import LineMap
+        from service.line_maker import LineMaker
+
+        lines = config.lines
+        period_ns = round(lines.period_s * 1e9)
+        makers.append(LineMaker(LineMap(), fed_by, period_ns=period_ns, min_seen=lines.min_scans))
+    return makers
 
 
 def _artos_map(config: Config, polar: Sequence[PolarLayer]) -> ArtosLayer:

@@ -661,6 +661,15 @@ class Artos(Section):
     period_s: float = Field(default=0.2, ge=0.05, le=10, description="Time between two updates.")
 
 
+class LineMapSettings(Section):
+    """The map of walls as straight lines: key map/lines."""
+
+    enabled: bool = Field(default=True, description="Keep it.")
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Lasers that draw it; default: all.")
+    period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two that are published.")
+    min_scans: int = Field(default=2, ge=1, le=255, description="Scans that must have seen a line before it is told.")
+
+
 class Alignment(Section):
     """How long readings wait for each other."""
 
@@ -839,6 +848,7 @@ class Config(Section):
     grid: Grid = Field(default=Grid(), description="The grid of the whole building.")
     local_grid: LocalGrid = Field(default=LocalGrid(), description="The grid around the robot.")
     artos: Artos = Field(default=Artos(), description="The ARTOS two-step map.")
+    lines: LineMapSettings = Field(default=LineMapSettings(), description="The map of walls as lines.")
     alignment: Alignment = Field(default=Alignment(), description="How long readings wait for each other.")
     network: Network = Field(default=Network(), description="The Zenoh router.")
     ros: Ros = Field(default=Ros(), description="ROS 2 beside our own keys.")

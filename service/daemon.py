@@ -1,6 +1,7 @@
 """The daemon: which threads there are, in which order they start and stop, and that the process always ends.
 
     wires (one thread each) --> fusion thread --> publisher's threads        keeper thread --> store
+                                     \\--> maps thread --^
     main thread: waits for a signal
 
 Start: the map's file, the kernels (warm before a port is opened, or the first scans would wait for them), the router,
@@ -22,6 +23,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -35,6 +37,7 @@ from service.config import Config, Loaded
 from service.errors import Trouble
 from service.live_map import LiveMap, restore
 from service.locks import Claims
+from service.map_makers import MapMakers, SweepTap
 from service.outputs import HealthOut, Output
 from service.payloads import RobotInfo, SensorPlace
 from service.publisher import Publisher
@@ -133,21 +136,29 @@ class Daemon:
         with _told_if_slow("compiling the kernels, as after each update: some 20 s"):
             assemble.warm_up(config)
         starting()
-        self._fusion = RecordedFusion(
-            assemble.parts(config, self._sensors, maps, assemble.localiser(config, start_pose or IDENTITY))
+        self._makers = MapMakers(
+            assemble.map_makers(config, self._sensors), self._publisher.offer, now_ns=self._clock.now_ns
         )
+        if store is not None:
+            self._makers.restore(store.load_tiles)
+        parts = assemble.parts(config, self._sensors, maps, assemble.localiser(config, start_pose or IDENTITY))
+        if sources := self._makers.sources:
+            parts = replace(parts, grids=(*parts.grids, SweepTap(self._makers, sources)))
+        self._fusion = RecordedFusion(parts)
         self._building = maps.building
         self._fusion.recorder = self._recorder
         self._worker = Worker(
             self._fusion,
-            self._offer if config.mavlink.enabled else self._publisher.offer,
+            self._offer,
             now_ns=self._clock.now_ns,
             beat=self._notifier.beat,
             health=self._health,
         )
         self._live_map = None
         if maps.building is not None:
-            self._live_map = LiveMap(maps.building, store, ask=self._worker.ask, pose=self._fusion.pose)
+            self._live_map = LiveMap(
+                maps.building, store, ask=self._worker.ask, pose=self._fusion.pose, makers=self._makers
+            )
             self._publisher.calls.register_map_service(self._live_map)
             self._parts.callback(self._finish_map, self._live_map)
         sink = self._recorder.sink(self._worker.sink)
@@ -161,6 +172,8 @@ class Daemon:
         if config.recording.enabled:
             self._begin_recording(start_pose or IDENTITY, complete=True)
         self._publisher.publish_info(robot_info(config, self._wall_ns()))
+        self._parts.callback(self._stop_makers)
+        self._makers.start()
         self._worker.start()
         self._parts.callback(self._stop_worker)
         if self._mavlink is not None:
@@ -211,6 +224,7 @@ class Daemon:
                 **{f"publish.{name}": count for name, count in self._publisher.counters().items()},
                 **({} if self._live_map is None else self._live_map.counters()),
                 **self._recorder.counters(),
+                **self._makers.counters(),
                 **({} if self._mavlink is None else self._mavlink.counters()),
             },
             troubles=[*self._fusion.troubles(now_ns), *self._map_troubles(), *self._other_troubles()],
@@ -268,8 +282,8 @@ class Daemon:
         return [trouble for trouble in troubles if trouble is not None]
 
     def _offer(self, output: Output) -> None:
-        """Where outputs go if an autopilot is to have them too."""
         self._publisher.offer(output)
+        self._makers.take_output(output)
         if self._mavlink is not None:
             self._mavlink.offer(output)
 
@@ -296,6 +310,9 @@ class Daemon:
 
     def _stop_worker(self) -> None:
         self._note(self._worker.stop(_FUSION_STOP_S))
+
+    def _stop_makers(self) -> None:
+        self._note(self._makers.stop(_FUSION_STOP_S))
 
     def _finish_map(self, live_map: LiveMap) -> None:
         try:

@@ -17,6 +17,7 @@ from mapping.grids.occupancy import GridTile, OccupancyGrid
 from mapping.grids.tiles import TILE
 from service.errors import Trouble
 from service.layers import BuildingLayer
+from service.map_makers import MapMakers
 from service.rpc import CallRefused
 from service.store import OCCUPANCY, SUFFIX, MapStore, SnapshotQueue, Tile, list_maps, occupancy_tiles
 
@@ -38,14 +39,21 @@ class LiveMap:
     """One building's grid and the store behind it. Calls may come from any thread."""
 
     def __init__(
-        self, layer: BuildingLayer, store: MapStore | None, *, ask: Ask, pose: Callable[[], Pose2 | None]
+        self,
+        layer: BuildingLayer,
+        store: MapStore | None,
+        *,
+        ask: Ask,
+        pose: Callable[[], Pose2 | None],
+        makers: MapMakers | None = None,
     ) -> None:
-        """pose: where the robot is in the map, asked where the grid may be touched."""
+        """pose: where the robot is in the map, asked where the grid may be touched.  makers: kept too."""
         self._layer = layer
         self._store = store
         self._queue = None if store is None else SnapshotQueue(store)
         self._ask = ask
         self._pose = pose
+        self._makers = makers
 
     # --- while running
 
@@ -57,6 +65,9 @@ class LiveMap:
         if changed:
             self._queue.offer(GRID, ((tile.tile_row, tile.tile_col, tile.payload()) for tile in changed))
             self._queue.offer(OCCUPANCY, occupancy_of(changed), self._meta(pose))
+        for name, tiles in ({} if self._makers is None else self._makers.changed_tiles()).items():
+            if tiles:
+                self._queue.offer(name, tiles)
         return self._queue.commit()
 
     def counters(self) -> dict[str, int]:
@@ -100,6 +111,7 @@ class LiveMap:
         with MapStore.open(path, wall_ns=lambda: 0, read_only=True) as saved:
             tiles = saved.load_tiles(GRID)
             ready_made = saved.load_tiles(OCCUPANCY)
+            made = {} if self._makers is None else {name: saved.load_tiles(name) for name in self._makers.layers}
             check_fits(self._layer.grid, saved)
         if not tiles:
             raise CallRefused(f"{path}: holds no grid to go on with; `umfeld map import` makes one from a picture")
@@ -107,7 +119,9 @@ class LiveMap:
         self.snapshot()  # so that nothing older waits behind what is written next
         self._ask(lambda: replace_tiles(self._layer, tiles))
         meta = self._meta(None)
-        store.snapshot({GRID: tiles, OCCUPANCY: ready_made}, meta, replace=True)
+        if self._makers is not None:
+            self._makers.restore(lambda name: made[name])
+        store.snapshot({GRID: tiles, OCCUPANCY: ready_made, **made}, meta, replace=True)
         return {"name": name, "path": str(path), "tiles": len(tiles)}
 
     def _check_tiles(self, path: Path, tiles: Iterable[Tile]) -> None:

@@ -5,6 +5,7 @@ Stamps are host monotonic nanoseconds; the publisher turns them into wall time a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,4 +134,16 @@ class HealthOut:
     process: dict[str, float]  # cpu_percent, memory_mb, ...
 
 
-Output = ScanOut | RangesOut | PolarOut | RectOut | OdomOut | PoseOut | GridOut | GridUpdateOut | HealthOut
+@dataclass(frozen=True, slots=True)
+class DocumentOut:
+    """A JSON document: key `key`, a row of topics.py. fields: what it says, in plain JSON values; schema and stamp are
+    added where it is encoded, and an optional `frame` stands in fields like the rest."""
+
+    key: str
+    stamp_ns: int
+    fields: Mapping[str, object]
+
+
+Output = (
+    ScanOut | RangesOut | PolarOut | RectOut | OdomOut | PoseOut | GridOut | GridUpdateOut | HealthOut | DocumentOut
+)

@@ -23,6 +23,7 @@ from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot, SectorState
 from service import cdr, topics
 from service.export import grid_origin
 from service.outputs import (
+    DocumentOut,
     GridOut,
     GridUpdateOut,
     HealthOut,
@@ -137,6 +138,8 @@ class Encoder:
                 return self._grid_update(output, wall_offset_ns)
             case HealthOut():
                 return self._health(output, wall_offset_ns)
+            case DocumentOut():
+                return [document_message(output, wall_offset_ns)]
 
     def info(self, info: RobotInfo) -> list[Message]:
         """The messages of `info` and of the fixed transforms, `tf/static`."""
@@ -311,6 +314,13 @@ def _pieces(cells: NDArray[np.int8]) -> list[tuple[int, int, NDArray[np.int8]]]:
         for row in range(0, rows, height)
         for column in range(0, columns, width)
     ]
+
+
+def document_message(out: DocumentOut, wall_offset_ns: int) -> Message:
+    """A document with its schema and stamp before its own fields. ValueError if a number in it is not finite."""
+    topic, stamp_ns = topics.topic_of(out.key), out.stamp_ns + wall_offset_ns
+    document = {"schema": topic.payload, "stamp": stamp_document(stamp_ns), **out.fields}
+    return Message(topic, out.key, _json(document), stamp_ns)
 
 
 def laser_message(scan: Scan, frame: str, stamp_ns: int, scan_time_s: float) -> cdr.Laser:

@@ -18,7 +18,18 @@ from typing import Any
 
 from service import export, topics, zenoh_session
 from service.clock import Clock
-from service.outputs import GridOut, GridUpdateOut, HealthOut, OdomOut, Output, PolarOut, PoseOut, RectOut, ScanOut
+from service.outputs import (
+    DocumentOut,
+    GridOut,
+    GridUpdateOut,
+    HealthOut,
+    OdomOut,
+    Output,
+    PolarOut,
+    PoseOut,
+    RectOut,
+    ScanOut,
+)
 from service.payloads import Encoder, Message, RobotInfo
 from service.ros import RosMirror, RosSettings
 from service.rpc import Calls
@@ -155,6 +166,8 @@ class Publisher:
                 self._outboxes[Lane.MAP].put(slot, parcel, supersedes=topics.MAP_GRID_UPDATE.pattern)
             case GridOut():
                 self._outboxes[Lane.MAP].put(slot, parcel)
+            case DocumentOut():
+                self._outboxes[topics.topic_of(output.key).lane].put(slot, parcel)
             case GridUpdateOut():
                 self._outboxes[Lane.MAP].put(slot, parcel, depth=_UPDATES_WAITING_MAX)
             case _:
@@ -312,5 +325,7 @@ def slot_of(output: Output) -> str:
             return topics.MAP_GRID_UPDATE.pattern
         case HealthOut():
             return "health"
+        case DocumentOut():
+            return output.key
         case _:
             return f"range/{output.sensor}"

@@ -15,6 +15,7 @@ JSON_RANGES = "application/json;umfeld.ranges.v1"
 JSON_HEALTH = "application/json;umfeld.health.v1"
 JSON_INFO = "application/json;umfeld.info.v1"
 JSON_GRID = "application/json;umfeld.grid.v1"
+JSON_LINES = "application/json;umfeld.lines.v1"
 JSON_REPLY = "application/json;umfeld.reply.v1"
 
 _CHUNK = re.compile(r"[a-z0-9_-]+\Z")
@@ -206,6 +207,16 @@ MAP_ARTOS = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+MAP_LINES = Topic(
+    "map/lines",
+    "umfeld.lines.v1",
+    JSON_LINES,
+    "at most 1 Hz, on change",
+    "Walls as straight lines with their uncertainty.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 HEALTH = Topic(
     "health",
     DIAGNOSTICS,
@@ -259,6 +270,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_GRID_UPDATE,
     MAP_LOCAL,
     MAP_ARTOS,
+    MAP_LINES,
     HEALTH,
     HEALTH_JSON,  # before health/<sensor>: the exact key wins
     HEALTH_ONE,

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,33 +13,24 @@ from mapping.lines.extract import LineExtractor, LineRules, extract_from_points
 from mapping.lines.line_map import LineMap
 from mapping.lines.lines import Lines, no_lines
 from mapping.scan import Scan
+from service.map_makers import MapView, Tile
+from service.outputs import DocumentOut, Output
 
 F64 = NDArray[np.float64]
 
-SCHEMA = "umfeld.lines.v1"
+KEY = "map/lines"
 _STILL_M = 1e-3
 _STILL_RAD = 2e-4
 _NANOS = 1_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class LinesOut:
-    """Key map/lines: every line that is sure enough. version: rises when the map changes."""
-
-    stamp_ns: int
-    version: int
-    lines: Lines
-    frame: str = "map"
-
-
-def lines_json(out: LinesOut, wall_offset_ns: int) -> bytes:
-    """The document umfeld.lines.v1. wall_offset_ns: wall clock minus the clock of the stamps.
+def lines_fields(lines: Lines, *, version: int, frame: str = "map") -> dict[str, object]:
+    """The document umfeld.lines.v1 but for its schema and stamp. version: rises when the map changes.
 
     Each line: start and end (free space to the right of the walk), angle and distance of its perpendicular with their
     covariance, supporting points, scans that saw it. Metres and radians, at most 300 bytes a line.
     """
-    angle, distance, covariance = out.lines.parameters()
-    wall_ns = out.stamp_ns + wall_offset_ns
+    angle, distance, covariance = lines.parameters()
     entries = [
         {
             "start": [round(float(v), 4) + 0.0 for v in start],
@@ -53,22 +42,15 @@ def lines_json(out: LinesOut, wall_offset_ns: int) -> bytes:
             "scans": int(seen),
         }
         for start, end, a, d, c, points, seen in zip(
-            out.lines.start_m, out.lines.end_m, angle, distance, covariance, out.lines.count, out.lines.seen
+            lines.start_m, lines.end_m, angle, distance, covariance, lines.count, lines.seen
         )
     ]
-    document = {
-        "schema": SCHEMA,
-        "stamp": {"sec": wall_ns // _NANOS, "nanosec": wall_ns % _NANOS},
-        "frame": out.frame,
-        "version": out.version,
-        "lines": entries,
-    }
-    return json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
+    return {"frame": frame, "version": version, "lines": entries}
 
 
-class LineLayer:
-    """A LineMap as fusion sees a map: fed by sweeps of some lasers, published when it has changed, at most once a
-    period. A robot that stands adds nothing: the same wall seen a thousand times from one place is no surer."""
+class LineMaker:
+    """A LineMap as a map maker: fed by sweeps of some lasers, published when it has changed. A robot that stands adds
+    nothing: the same wall seen a thousand times from one place is no surer."""
 
     def __init__(
         self,
@@ -83,14 +65,16 @@ class LineLayer:
     ) -> None:
         """min_seen: scans that must have seen a line before it is published.  step_m, step_rad: how far a sensor must
         have moved or turned for its next sweep to count."""
+        self.name = "lines"
         self.line_map = line_map
         self.sources = frozenset(sources)
-        self._period_ns, self._min_seen, self._step_m, self._step_rad = period_ns, min_seen, step_m, step_rad
+        self.period_ns = period_ns
+        self._min_seen, self._step_m, self._step_rad = min_seen, step_m, step_rad
         self._rules = rules or LineRules()
         self._extractors: dict[str, tuple[F64, LineExtractor]] = {}
         self._last: dict[str, Pose2] = {}
         self._told_version = 0
-        self._told_ns: int | None = None
+        self._kept_version = 0
 
     def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
         """Add one sweep's lines. map_from_sensor: (N, 3) the pose of every beam, or (3,) one for all; a sweep of which
@@ -104,17 +88,25 @@ class LineLayer:
             self._last[source] = middle
             self.line_map.insert(lines, middle)
 
-    def take_round(self, source: str, heard: object, map_from_base: Pose2) -> None:
-        """Cones have no lines."""
-
-    def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[LinesOut]:
-        """The map, if it has changed since it was last told and a period has passed."""
+    def make(self, view: MapView) -> list[Output]:
+        """The map, if it has changed since it was last told."""
         if self.line_map.version == self._told_version:
             return []
-        if self._told_ns is not None and now_ns - self._told_ns < self._period_ns:
+        self._told_version = self.line_map.version
+        fields = lines_fields(self.line_map.lines(min_seen=self._min_seen), version=self.line_map.version)
+        return [DocumentOut(KEY, view.stamp_ns, fields)]
+
+    def changed_tiles(self) -> list[Tile]:
+        """The lines that are told, in 20 bytes each."""
+        if self.line_map.version == self._kept_version:
             return []
-        self._told_version, self._told_ns = self.line_map.version, now_ns
-        return [LinesOut(stamp_ns, self.line_map.version, self.line_map.lines(min_seen=self._min_seen))]
+        self._kept_version = self.line_map.version
+        return [(0, 0, self.line_map.to_bytes(min_seen=self._min_seen))]
+
+    def restore(self, tiles: Iterable[Tile]) -> None:
+        """Go on with stored lines. ValueError if they are damaged."""
+        stored = [payload for _, _, payload in tiles]
+        self.start_anew(LineMap.from_bytes(stored[0], self.line_map.rules) if stored else None)
 
     def start_anew(self, line_map: LineMap | None = None) -> None:
         """The map was replaced, or begins again."""

@@ -1,0 +1,350 @@
+"""Maps that take their time (lines, rooms, planes, scenes, topology): made on one thread of their own from what fusion
+hands out, so that a slow one delays neither a scan nor a grid.
+
+    fusion --sweeps with their poses--> bounded queue --+
+    fusion --grids and updates------> newest, mirrored --+--> maker.make(view) --> outputs, as from fusion
+
+A maker is pure: it gets everything on this thread, asks for no time, and keeps its map in tiles of the store. What it
+cannot cope with is counted (`makers.errors`) and told once a kind; the other makers go on. Sweeps that come faster than
+makers work are lost from the front of the queue and counted (`makers.sweeps_lost`): such a map is thinner, never wrong.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.frames import Pose2
+from mapping.grids.patch import GridPatch
+from mapping.scan import Scan
+from service.errors import Trouble
+from service.fusion import Round
+from service.outputs import GridOut, GridUpdateOut, Output, PoseOut
+
+log = logging.getLogger(__name__)
+
+F64 = NDArray[np.float64]
+T = TypeVar("T")
+
+SWEEPS_WAITING_MAX = 128
+_GRIDS_WAITING_MAX = 256
+_TURN_S = 0.1
+_ASK_LIMIT_S = 10.0
+Tile = tuple[int, int, bytes]
+Sweep = tuple[str, Scan, F64]
+
+
+@dataclass(frozen=True, slots=True)
+class Rect:
+    """Cells [row0, row0 + rows) x [col0, col0 + cols) of the map-fixed grid."""
+
+    row0: int
+    col0: int
+    rows: int
+    cols: int
+
+
+@dataclass(frozen=True, slots=True)
+class MapView:
+    """What a maker sees. grid: the map-fixed grid as last published, not to be written to nor kept; None before that.
+
+    changed: where it differs from the maker's last view (the grid may also have grown: compare row0, col0 and shape).
+    map_from_base: the newest pose, None while unknown.  stamp_ns: of the newest of it all.
+    """
+
+    stamp_ns: int
+    grid: GridPatch | None
+    changed: tuple[Rect, ...]
+    map_from_base: Pose2 | None
+
+
+class MapMaker(Protocol):
+    """One map of its own making. All calls come from the makers' thread (start: before it runs)."""
+
+    @property
+    def name(self) -> str:
+        """Names its layer in the store and its counters."""
+
+    @property
+    def sources(self) -> frozenset[str]:
+        """Lasers whose sweeps it wants; empty for a map made from the grid alone."""
+
+    @property
+    def period_ns(self) -> int:
+        """Shortest time between two calls of make."""
+
+    def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
+        """One sweep, map_from_sensor as in GridLayer: (N, 3) or (3,)."""
+
+    def make(self, view: MapView) -> list[Output]:
+        """Bring the map up to date; what is to be published. Called when the grid changed or a sweep was taken."""
+
+    def changed_tiles(self) -> list[Tile]:
+        """What to keep in the store, as far as it changed since the last call. (row, col) are the maker's own keys."""
+
+    def restore(self, tiles: Iterable[Tile]) -> None:
+        """Take up what changed_tiles gave out earlier; begin empty if there is nothing. ValueError if it is damaged."""
+
+
+@dataclass(slots=True)
+class _Desk:
+    """What the thread remembers of one maker."""
+
+    maker: MapMaker
+    due_ns: int = 0
+    is_fed: bool = False
+    changed: list[Rect] | None = None  # None: nothing
+
+
+class MapMakers:
+    """Owns the makers and their thread. offer: where outputs go."""
+
+    def __init__(
+        self, makers: Sequence[MapMaker], offer: Callable[[Output], None], *, now_ns: Callable[[], int]
+    ) -> None:
+        self._desks = [_Desk(maker) for maker in makers]
+        self._offer = offer
+        self._now_ns = now_ns
+        self._sweeps: deque[Sweep] = deque()
+        self._grids: deque[GridOut | GridUpdateOut] = deque()
+        self._asked: deque[tuple[Callable[[], object], threading.Event, list[object]]] = deque()
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="maps", daemon=True)
+        self._mirror = _Mirror()
+        self._pose: PoseOut | None = None
+        self._complained: set[str] = set()
+        self.counts = {"makers.sweeps_lost": 0, "makers.grids_lost": 0, "makers.errors": 0}
+
+    @property
+    def sources(self) -> frozenset[str]:
+        """Every laser that a maker wants sweeps of."""
+        return frozenset().union(*(desk.maker.sources for desk in self._desks))
+
+    @property
+    def layers(self) -> list[str]:
+        """Names of their layers in the store."""
+        return [layer_of(desk.maker) for desk in self._desks]
+
+    # --- from other threads
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self, deadline_s: float) -> bool:
+        """End after the turn under way; False if that took longer."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(deadline_s)
+        return not self._thread.is_alive()
+
+    def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
+        """From fusion; never blocks."""
+        with self._changed:
+            self._sweeps.append((source, scan, map_from_sensor))
+            if len(self._sweeps) > SWEEPS_WAITING_MAX:
+                self._sweeps.popleft()
+                self.counts["makers.sweeps_lost"] += 1
+
+    def take_output(self, output: Output) -> None:
+        """Everything that is published passes here; grids and poses are of use. Never blocks."""
+        match output:
+            case PoseOut():
+                self._pose = output
+            case GridOut(name="grid"):
+                with self._changed:
+                    self._grids.clear()  # it says all that they would
+                    self._grids.append(output)
+            case GridUpdateOut():
+                with self._changed:
+                    self._grids.append(output)
+                    if len(self._grids) > _GRIDS_WAITING_MAX:
+                        self._grids.popleft()
+                        self.counts["makers.grids_lost"] += 1
+
+    def ask(self, work: Callable[[], T]) -> T:
+        """Run a function between two turns and give its result: for calls that look into a maker's map."""
+        if not self._thread.is_alive() or threading.current_thread() is self._thread:
+            return work()
+        done, result = threading.Event(), list[object]()
+        with self._changed:
+            self._asked.append((work, done, result))
+            self._changed.notify_all()
+        if not done.wait(_ASK_LIMIT_S):
+            raise Trouble(f"the thread of the slow maps did not answer within {_ASK_LIMIT_S:.0f} s; see its log")
+        error, value = result
+        if isinstance(error, BaseException):
+            raise error
+        return value  # type: ignore[return-value]
+
+    def changed_tiles(self) -> dict[str, list[Tile]]:
+        """By layer of the store."""
+        return self.ask(lambda: {layer_of(desk.maker): desk.maker.changed_tiles() for desk in self._desks})
+
+    def restore(self, load: Callable[[str], Iterable[Tile]]) -> None:
+        """Take up every maker's map from the store's layers; a damaged one begins empty and says so."""
+
+        def take() -> None:
+            for desk in self._desks:
+                try:
+                    desk.is_fed = True  # so that what was taken up is published
+                    desk.maker.restore(load(layer_of(desk.maker)))
+                except ValueError as error:
+                    log.error("%s: begins empty: what was stored cannot be used: %s", desk.maker.name, error)
+                    desk.maker.restore(())
+
+        self.ask(take)
+
+    def counters(self) -> Mapping[str, int]:
+        return dict(self.counts)
+
+    # --- the thread
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                if not (self._stopping or self._asked):
+                    self._changed.wait(_TURN_S)
+                last = self._stopping
+            self.turn(self._now_ns())
+            if last:
+                return
+
+    def turn(self, now_ns: int) -> None:
+        """Work off what waits; tests call it without the thread."""
+        with self._changed:
+            sweeps, self._sweeps = self._sweeps, deque()
+            grids, self._grids = self._grids, deque()
+            asked, self._asked = self._asked, deque()
+        for work, done, result in asked:
+            try:
+                result.extend((None, work()))
+            except BaseException as error:  # it belongs to the thread that asked
+                result.extend((error, None))
+            done.set()
+        for output in grids:
+            self._note(self._mirror.take(output))
+        for desk in self._desks:
+            for source, scan, map_from_sensor in sweeps:
+                if source in desk.maker.sources:
+                    desk.is_fed = True
+                    self._guard(desk, partial(desk.maker.take_sweep, source, scan, map_from_sensor))
+            if now_ns >= desk.due_ns and (desk.is_fed or desk.changed):
+                self._make(desk, now_ns)
+
+    def _note(self, changed: Rect | None) -> None:
+        if changed is not None:
+            for desk in self._desks:
+                desk.changed = [*(desk.changed or ()), changed]
+
+    def _make(self, desk: _Desk, now_ns: int) -> None:
+        pose = self._pose
+        stamp_ns = max(self._mirror.stamp_ns, 0 if pose is None else pose.stamp_ns)
+        view = MapView(
+            stamp_ns, self._mirror.patch, tuple(desk.changed or ()), None if pose is None else pose.map_from_base
+        )
+        desk.due_ns, desk.is_fed, desk.changed = now_ns + desk.maker.period_ns, False, None
+
+        def make() -> None:
+            for output in desk.maker.make(view):
+                self._offer(output)
+
+        self._guard(desk, make)
+
+    def _guard(self, desk: _Desk, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception as error:
+            self.counts["makers.errors"] += 1
+            kind = f"{desk.maker.name}: {type(error).__name__}: {error}"[:200]
+            if kind not in self._complained and len(self._complained) < 100:
+                self._complained.add(kind)
+                log.exception("internal error in a map maker: %s", kind)
+
+
+class SweepTap:
+    """A grid layer, as fusion sees it, that draws nothing and passes posed sweeps on."""
+
+    def __init__(self, makers: MapMakers, sources: Iterable[str]) -> None:
+        self._makers = makers
+        self.sources = frozenset(sources)
+
+    def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
+        self._makers.take_sweep(source, scan, map_from_sensor)
+
+    def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
+        """Cones go into grids only."""
+
+    def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
+        return []
+
+
+class _Mirror:
+    """The published grid, put together from whole grids and updates as a subscriber would."""
+
+    def __init__(self) -> None:
+        self.patch: GridPatch | None = None
+        self.stamp_ns = 0
+        self._epoch = -1
+
+    def take(self, output: GridOut | GridUpdateOut) -> Rect | None:
+        """Take one in; where it changed something."""
+        if isinstance(output, GridOut):
+            return self._replace(output)
+        if self.patch is None or output.epoch != self._epoch:
+            return None
+        self.stamp_ns = output.stamp_ns
+        return self._paste(self.patch, output.patch)
+
+    def _replace(self, output: GridOut) -> Rect | None:
+        old, new = self.patch, output.patch
+        self.patch = GridPatch(new.resolution_m, new.row0, new.col0, new.cells.copy())
+        self.stamp_ns, self._epoch = output.stamp_ns, output.epoch
+        was = np.full_like(new.cells, -1)
+        if old is not None and old.resolution_m == new.resolution_m:
+            into, out_of = _overlap(was.shape, (new.row0, new.col0), old)
+            was[into] = old.cells[out_of]
+        return _bounds(was != new.cells, new.row0, new.col0)
+
+    def _paste(self, mirror: GridPatch, piece: GridPatch) -> Rect | None:
+        into, out_of = _overlap(mirror.cells.shape, (mirror.row0, mirror.col0), piece)
+        target, source = mirror.cells[into], piece.cells[out_of]
+        changed = _bounds(target != source, mirror.row0 + into[0].start, mirror.col0 + into[1].start)
+        target[...] = source
+        return changed
+
+
+def _overlap(
+    shape: tuple[int, ...], origin: tuple[int, int], piece: GridPatch
+) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Slices of the common part: in an array of this shape and origin, and in the piece."""
+    slices = []
+    for size, first, piece_first, piece_size in zip(shape, origin, (piece.row0, piece.col0), piece.cells.shape):
+        begin = max(first, piece_first)
+        end = max(begin, min(first + size, piece_first + piece_size))
+        slices.append((slice(begin - first, end - first), slice(begin - piece_first, end - piece_first)))
+    (rows_into, rows_from), (cols_into, cols_from) = slices
+    return (rows_into, cols_into), (rows_from, cols_from)
+
+
+def _bounds(mask: NDArray[np.bool_], row0: int, col0: int) -> Rect | None:
+    """The box around what is true."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return None
+    return Rect(row0 + int(rows[0]), col0 + int(cols[0]), int(rows[-1] - rows[0]) + 1, int(cols[-1] - cols[0]) + 1)
+
+
+def layer_of(maker: MapMaker) -> str:
+    """The name of a maker's layer of tiles in the store."""
+    return f"maker-{maker.name}"
