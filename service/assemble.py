@@ -604,6 +604,10 @@ def _mavlink_sources(config: Config) -> list[tuple[str, str]]:
 def warm_up(config: Config) -> None:
     """Load or compile every kernel this configuration uses, on maps that are thrown away."""
     found = sensors(config)
+    if map_makers(config, found) and config.lines.enabled:
+        from mapping.lines.warm_up import warm_up as warm_up_lines
+
+        warm_up_lines()
     fusion = Fusion(parts(config, found, maps(config, found), OdometryOnly()))
     now_ns = 0
     for step in range(4):  # standing, then moving: the two take different kernels
