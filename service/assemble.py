@@ -19,14 +19,15 @@ from drivers.reader import Sink, WireReader
 from drivers.readings import ChainReading, RangeReading, RangeStatus, Reading, ScanReading, WheelReading
 from mapping.frames import Pose2
 from mapping.odometry import DriveGeometry
-from service.config import (
+from service.config import Config
+from service.config_base import PlanePose
+from service.config_devices import (
     SERIAL_NUMBER,
     SHARED_DRIVERS,
     ArduinoSonars,
     ArduinoWheels,
     CanBus,
     Cia406Wheels,
-    Config,
     Device,
     Drive,
     HokuyoLaser,
@@ -36,7 +37,6 @@ from service.config import (
     MaxBotixSonars,
     Mount,
     ODriveWheels,
-    PlanePose,
     RoboClawWheels,
     RplidarLaser,
     SickColaLaser,

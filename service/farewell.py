@@ -17,7 +17,8 @@ from drivers.conversation import SetBaudRate
 from drivers.errors import DriverError
 from drivers.ports import Clock, Port
 from service import assemble
-from service.config import Config, HokuyoLaser, RplidarLaser, SickLms2xxLaser
+from service.config import Config
+from service.config_devices import HokuyoLaser, RplidarLaser, SickLms2xxLaser
 from service.errors import Trouble
 from service.locks import Claims
 

@@ -104,7 +104,7 @@ def _pace(player: Replay, speed: float) -> Callable[[int], None]:
 @contextmanager
 def _published(player: Replay, endpoint: str) -> Iterator[None]:
     """What comes out is published as a daemon would, by the recording's clock."""
-    from service.config import is_local
+    from service.config_around import is_local
     from service.daemon import robot_info
     from service.publisher import Publisher
     from service.zenoh_session import NetworkSettings

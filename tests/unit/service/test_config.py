@@ -10,7 +10,8 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from service.config import Config, HokuyoLaser, Loaded, UsBoardSonars, load
+from service.config import Config, Loaded, load
+from service.config_devices import HokuyoLaser, UsBoardSonars
 from service.config_files import daemon_endpoint, find_config, lines_of_keys
 from service.config_text import EXAMPLE, effective_values, reference
 from service.errors import WrongUsage

@@ -17,7 +17,8 @@ from drivers.laser_sick_cola import SickColaConversation
 from drivers.laser_sick_lms2xx import SickLms2xxConversation
 from drivers.ports import SerialPort, TcpPort
 from service.assemble import conversation_of, sensors, wires
-from service.config import Config, load, tcp_address
+from service.config import Config, load
+from service.config_devices import tcp_address
 from service.errors import WrongUsage
 from service.sensors import Laser
 

@@ -1,0 +1,116 @@
+"""The maps in the configuration."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from service.config_base import Name, PlanePose, Positive, Reference, Section
+
+
+class PolarSectorMap(Section):
+    """A polar sector map: per wedge of bearings the nearest obstacle and what is known."""
+
+    sources: tuple[Reference, ...] = Field(
+        min_length=1, description="Lasers and sonars that feed it; lasers.NAME or sonars.NAME where both have the name."
+    )
+    sector_deg: float = Field(default=5.0, gt=0, le=180, description="Width of a sector.")
+    start_deg: float = Field(default=-120.0, ge=-360, le=360, description="Where the first sector begins.")
+    stop_deg: float = Field(default=120.0, ge=-360, le=360, description="Where the last one ends.")
+    range_max_m: Positive | None = Field(default=None, description="What lies farther does not count; default: all.")
+    pose: PlanePose = Field(default=PlanePose(), description="The virtual sensor in the base frame.")
+
+    @model_validator(mode="after")
+    def _whole_sectors(self) -> PolarSectorMap:
+        span = self.stop_deg - self.start_deg
+        if not 0 < span <= 360:
+            raise ValueError("stop_deg must lie above start_deg, by at most 360")
+        count = span / self.sector_deg
+        if abs(count - round(count)) > 1e-6:
+            raise ValueError(f"{span:g} degrees are not a whole number of sectors of {self.sector_deg:g}")
+        return self
+
+
+class RectSectorMap(Section):
+    """A rectangular sector map around the robot: per square the nearest obstacle and what is known."""
+
+    sources: tuple[Reference, ...] = Field(
+        min_length=1, description="Lasers and sonars that feed it; lasers.NAME or sonars.NAME where both have the name."
+    )
+    size_m: tuple[Positive, Positive] = Field(
+        default=(4.0, 4.0), description="Extent along x and y, centred on the pose."
+    )
+    sector_m: Positive = Field(default=0.25, description="Edge of a sector.")
+    pose: PlanePose = Field(default=PlanePose(), description="The virtual sensor in the base frame.")
+
+    @model_validator(mode="after")
+    def _whole_sectors(self) -> RectSectorMap:
+        for size in self.size_m:
+            count = size / self.sector_m
+            if abs(count - round(count)) > 1e-6:
+                raise ValueError(f"{size:g} m are not a whole number of sectors of {self.sector_m:g} m")
+        if math.prod(self.size_m) / self.sector_m**2 > 40000:
+            raise ValueError("more than 40000 sectors; take a larger sector_m or a smaller size_m")
+        return self
+
+
+class SectorMaps(Section):
+    """All sector maps by name."""
+
+    polar: dict[Name, PolarSectorMap] = Field(default={}, description="Polar sector maps.")
+    rect: dict[Name, RectSectorMap] = Field(default={}, description="Rectangular sector maps.")
+
+
+class Grid(Section):
+    """The occupancy grid of the whole building, fixed in the map frame."""
+
+    enabled: bool = Field(default=True, description="Keep it.")
+    resolution_m: float = Field(default=0.05, ge=0.005, le=1.0, description="Edge of a cell.")
+    model: Literal["counters", "log-odds"] = Field(default="counters", description="What a cell remembers.")
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Sensors that draw it; default: all.")
+    publish_period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two whole grids.")
+    update_period_s: float = Field(default=0.2, ge=0.2, le=3600, description="Shortest time between two updates.")
+
+
+class LocalGrid(Section):
+    """The occupancy grid around the robot, which rolls with it: key map/local."""
+
+    enabled: bool = Field(default=False, description="Keep it.")
+    size_m: float = Field(default=8.0, gt=0, le=200, description="Edge of the square it covers.")
+    period_s: float = Field(default=0.2, ge=0.05, le=10, description="Shortest time between two that are published.")
+    resolution_m: float = Field(default=0.05, ge=0.005, le=1.0, description="Edge of a cell.")
+    model: Literal["counters", "log-odds"] = Field(default="counters", description="What a cell remembers.")
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Sensors that draw it; default: all.")
+
+
+class Artos(Section):
+    """The two-step map of ARTOS from polar sector maps to a robot-centred grid: key map/artos."""
+
+    enabled: bool = Field(default=False, description="Keep it.")
+    size_m: float = Field(default=8.0, gt=0, le=100, description="Edge of the square it covers.")
+    resolution_m: float = Field(default=0.1, ge=0.01, le=1.0, description="Edge of a cell.")
+    sources: tuple[Name, ...] = Field(default=(), description="The [sectors.polar.NAME] it is made from; default: all.")
+    period_s: float = Field(default=0.2, ge=0.05, le=10, description="Time between two updates.")
+
+
+class LineMapSettings(Section):
+    """The map of walls as straight lines: key map/lines."""
+
+    enabled: bool = Field(default=True, description="Keep it.")
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Lasers that draw it; default: all.")
+    period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two that are published.")
+    min_scans: int = Field(default=2, ge=1, le=255, description="Scans that must have seen a line before it is told.")
+
+
+class Alignment(Section):
+    """How long readings wait for each other."""
+
+    odometry_wait_ms: int = Field(
+        default=500,
+        ge=20,
+        le=5000,
+        description="A scan waits this long for odometry that covers it, then it is dropped.",
+    )
+    odometry_memory_s: float = Field(default=30.0, ge=1, le=600, description="How far back poses are remembered.")
