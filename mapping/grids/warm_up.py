@@ -8,7 +8,7 @@ import numpy as np
 
 from mapping.frames import Pose2
 from mapping.grids.beam_model import beams_of_scan
-from mapping.grids.clearance import clearance_layer
+from mapping.grids.clearance import DistanceField, clearance_layer
 from mapping.grids.evidence import Model
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.scan import Scan
@@ -32,3 +32,5 @@ def warm_up(model: Model = "counters") -> None:
     for row, col, payload in list(grid.tiles()):
         grid.load_tile(row, col, payload)
     clearance_layer(grid.patch())
+    field = DistanceField(np.eye(3, dtype=np.bool_))
+    field.update([(0, 1), (0, 2)], [(0, 0), (1, 1)])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from mapping.grids.clearance import (
+    DistanceField,
     cell_size_for_clearance,
     clearance_layer,
     clearance_of_cell_size,
@@ -60,6 +61,74 @@ def test_a_long_thin_map_with_one_obstacle() -> None:
     found = squared_cell_distances(mask)
     assert found[0, 0] == 14_999**2 + 1
     assert found[1, 14_999] == 0
+
+
+@settings(max_examples=100, deadline=None)
+@given(masks(), st.integers(0, 2**32 - 1))
+def test_the_nearest_obstacle_is_named_and_ties_have_one_answer(mask: Mask, seed: int) -> None:
+    field = DistanceField(mask)
+    obstacles = np.argwhere(mask)
+    if obstacles.size == 0:
+        assert np.all(field.site == -1)
+        return
+    rng = np.random.default_rng(seed)
+    for row, col in rng.integers((0, 0), mask.shape, (20, 2)):
+        away = ((obstacles - (row, col)) ** 2).sum(axis=1)
+        row_of, col_of = min((c, r) for r, c in obstacles[away == away.min()])[::-1]
+        assert field.site[row, col] == row_of << 16 | col_of
+
+
+def change_of(field: DistanceField, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Some obstacles more, some or all of those there are gone; some of both lists say what is so already."""
+    added = rng.integers((0, 0), field.shape, (rng.integers(0, 12), 2))
+    if rng.random() < 0.3:  # a wall
+        row, col = rng.integers(0, field.shape[0]), rng.integers(0, field.shape[1])
+        added = np.array([(row, c) for c in range(col, min(col + 20, field.shape[1]))])
+    there = np.argwhere(field.obstacle)
+    lost = there[rng.random(len(there)) < rng.choice([0.0, 0.1, 0.6, 1.0])]
+    return added, np.concatenate((lost, rng.integers((0, 0), field.shape, (3, 2))))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(masks(), st.integers(0, 2**32 - 1), st.booleans())
+def test_an_updated_field_is_the_field_made_anew(mask: Mask, seed: int, tall: bool) -> None:
+    """Distances, nearest obstacles and the spans said to have changed, over six changes."""
+    rng = np.random.default_rng(seed)
+    field = DistanceField(np.repeat(mask, 4, axis=0) if tall else mask)  # rows beyond one word of bits
+    for _ in range(6):
+        before, obstacle = field.site.copy(), field.obstacle.copy()
+        added, removed = change_of(field, rng)
+        spans = field.update(added, removed)
+        obstacle[tuple(removed.T)] = False
+        if len(added):
+            obstacle[tuple(added.T)] = True
+        anew = DistanceField(obstacle)
+        assert np.array_equal(field.obstacle, obstacle)
+        assert np.array_equal(field.squared, anew.squared)
+        assert np.array_equal(field.site, anew.site)
+        cols = np.arange(field.shape[1])
+        inside = (cols >= spans[:, :1]) & (cols < spans[:, 1:])
+        assert not np.any((before != field.site) & ~inside)
+
+
+def test_the_order_of_a_change_does_not_matter() -> None:
+    mask = np.zeros((60, 70), dtype=np.bool_)
+    mask[10, 5:50] = True
+    cells = np.array([(30, c) for c in range(5, 60)])
+    fields = [DistanceField(mask) for _ in range(2)]
+    fields[0].update(cells, [(10, 5), (10, 6)])
+    fields[1].update(cells[::-1].repeat(2, axis=0), [(10, 6), (10, 5)])
+    assert np.array_equal(fields[0].site, fields[1].site)
+
+
+@pytest.mark.parametrize("cells", [[(0, 5)], [(4, 0)], [(-1, 0)], [(0.0, 1.0)], [(1, 2, 3)], [1, 2], [(0, 2**40)]])
+def test_changes_that_are_no_cells_are_refused_and_change_nothing(cells: list[tuple[int, int]]) -> None:
+    field = DistanceField(np.eye(4, 5, dtype=np.bool_))
+    before = field.site.copy()
+    for added, removed in ((cells, ()), ((), cells), ([(0, 1)], cells)):
+        with pytest.raises(ValueError, match="cell"):
+            field.update(added, removed)
+    assert np.array_equal(field.site, before)
 
 
 def test_empty_and_wrong_shapes() -> None:
