@@ -1,0 +1,288 @@
+"""Loops of the topological maps: the node nearest to a vector, without reading all nodes (S42).
+
+Two ways to read less, both exact. Marks: a bit for each node, dimension and interval; the bits that are set in all
+dimensions are the candidates. Bounds: each node as a few bytes whose distance, scaled, is never above the true one;
+only nodes whose bound is low enough are read in full. All arrays are C-contiguous; nodes (capacity, n) float64.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+WORD = 64  # nodes in a word of marks
+BLOCK = 1024  # nodes whose sums stay in the first-level cache while all directions are added
+GROUP = 8  # directions that are added at a time
+MOST_SHIFT = 8  # of a group's squares: sums of 16 groups stay below FAR
+FAR = 1 << 30  # above every sum
+GUARD = 1e-9  # for the rounding of 64-bit numbers in the rotation
+
+
+@njit(cache=True, nogil=True)
+def squared_up_to(node: Any, query: Any, limit: float) -> float:
+    """Squared distance, summed in order; inf as soon as it is above the limit."""
+    total = 0.0
+    n = query.shape[0]
+    first = 0
+    while first < n:
+        last = min(first + 8, n)
+        for r in range(first, last):
+            away = node[r] - query[r]
+            total += away * away
+        if total > limit:
+            return np.inf
+        first = last
+    return total
+
+
+@njit(cache=True, nogil=True)
+def nearest_flat(nodes: Any, count: int, query: Any) -> Any:
+    """(number, squared distance) of the nearest of the first count nodes; of equals the lowest number; -1 if none."""
+    best, best_squared = -1, np.inf
+    for j in range(count):
+        squared = squared_up_to(nodes[j], query, best_squared)
+        if squared < best_squared:
+            best, best_squared = j, squared
+    return best, best_squared
+
+
+@njit(cache=True, nogil=True)
+def two_nearest_flat(nodes: Any, alive: Any, query: Any) -> Any:
+    """(nearest, second, squared distance of the nearest) among the nodes that are alive; -1 where there is none."""
+    best, second = -1, -1
+    best_squared, second_squared = np.inf, np.inf
+    for j in range(nodes.shape[0]):
+        if not alive[j]:
+            continue
+        squared = squared_up_to(nodes[j], query, second_squared)
+        if squared < best_squared:
+            second, second_squared = best, best_squared
+            best, best_squared = j, squared
+        elif squared < second_squared:
+            second, second_squared = j, squared
+    return best, second, best_squared
+
+
+@njit(cache=True, nogil=True)
+def mark(marks: Any, number: int, low: Any, high: Any, on: bool) -> None:
+    """Set or clear a node's bit in the intervals low[r] .. high[r] of each dimension. marks: (n, intervals, words)."""
+    word, bit = number // WORD, np.uint64(1) << np.uint64(number % WORD)
+    for r in range(marks.shape[0]):
+        for q in range(low[r], high[r] + 1):
+            if on:
+                marks[r, q, word] |= bit
+            else:
+                marks[r, q, word] &= ~bit
+
+
+@njit(cache=True, nogil=True)
+def nearest_marked(marks: Any, words: int, interval: Any, nodes: Any, query: Any, most: int, common: Any) -> Any:
+    """(number, squared distance, candidates) of the nearest node that is marked in all dimensions.
+
+    interval: (n,) the query's interval in each dimension.  common: (words,) uint64 work.  Gives up with number -1 and
+    the count so far when more than `most` candidates would have to be read: another way is cheaper then.
+    """
+    dimensions = marks.shape[0]
+    for w in range(words):
+        common[w] = marks[0, interval[0], w]
+    for r in range(1, dimensions):
+        row = marks[r, interval[r]]
+        for w in range(words):
+            common[w] &= row[w]
+    candidates = 0
+    for w in range(words):
+        left = common[w]
+        while left != 0:
+            left &= left - np.uint64(1)
+            candidates += 1
+    if candidates > most:
+        return -1, np.inf, candidates
+    best, best_squared = -1, np.inf
+    for w in range(words):
+        left = common[w]
+        while left != 0:
+            lowest = left & (~left + np.uint64(1))
+            j = w * WORD + bit_number(lowest)
+            squared = squared_up_to(nodes[j], query, best_squared)
+            if squared < best_squared:
+                best, best_squared = j, squared
+            left ^= lowest
+    return best, best_squared, candidates
+
+
+@njit(cache=True, nogil=True)
+def bit_number(single: Any) -> int:
+    """Which bit of a word is set, given that one is."""
+    number = 0
+    for shift in (32, 16, 8, 4, 2, 1):
+        if single >> np.uint64(shift):
+            single >>= np.uint64(shift)
+            number += shift
+    return number
+
+
+@njit(cache=True, nogil=True)
+def code(vector: Any, centre: Any, axes: Any, origin: Any, steps: Any, codes: Any, errors: Any) -> None:
+    """A vector as one byte a direction, and how far that is off, summed up to each group of directions.
+
+    axes: (n, m) column by column the directions; m = GROUP * groups, padded with zeros.  origin: (m,) of the box.
+    steps: (groups,).  codes: (m,) uint8, written.  errors: (groups,), written: length of the rounding error in the
+    directions up to this group; clipping is not counted, it brings no two vectors farther apart.
+    """
+    coordinates = np.zeros(codes.shape[0])
+    for r in range(vector.shape[0]):
+        away = vector[r] - centre[r]
+        for d in range(codes.shape[0]):
+            coordinates[d] += away * axes[r, d]
+    squared = 0.0
+    for d in range(codes.shape[0]):
+        step = steps[d // GROUP]
+        inside = min(max((coordinates[d] - origin[d]) / step, 0.0), 255.0)
+        whole = np.floor(inside + 0.5)
+        codes[d] = np.uint8(min(whole, 255.0))
+        squared += ((inside - whole) * step) ** 2
+        errors[d // GROUP] = np.sqrt(squared)
+
+
+@njit(cache=True, nogil=True)
+def code_all(
+    nodes: Any,
+    first: int,
+    last: int,
+    centre: Any,
+    axes: Any,
+    origin: Any,
+    steps: Any,
+    columns: Any,
+    rows: Any,
+    errors: Any,
+) -> None:
+    """Code the nodes first .. last - 1, twice: columns (blocks, m, BLOCK) and rows (capacity, m), both uint8.
+
+    errors: (groups,), raised where these nodes are rounded more than any before.
+    """
+    off = np.empty(errors.shape[0])
+    for j in range(first, last):
+        code(nodes[j], centre, axes, origin, steps, rows[j], off)
+        for d in range(rows.shape[1]):
+            columns[j // BLOCK, d, j % BLOCK] = rows[j, d]
+        for g in range(errors.shape[0]):
+            errors[g] = max(errors[g], off[g])
+
+
+@njit(cache=True, nogil=True)
+def lead_sums(columns: Any, query: Any, lead: int, shifts: Any, part: Any) -> Any:
+    """Squared differences of the first `lead` groups of the nodes of a block, into part; the least of them.
+
+    columns: (m, BLOCK).  part: (nodes,) int32.  Four directions at a time, in 16-bit lanes: a third faster than one.
+    """
+    count = part.shape[0]
+    part[:] = 0
+    for d in range(0, lead * GROUP, 4):
+        by = np.int32(shifts[d // GROUP])
+        c0, c1, c2, c3 = columns[d], columns[d + 1], columns[d + 2], columns[d + 3]
+        q0, q1, q2, q3 = np.int16(query[d]), np.int16(query[d + 1]), np.int16(query[d + 2]), np.int16(query[d + 3])
+        for j in range(count):
+            a0, a1 = np.int16(np.int16(c0[j]) - q0), np.int16(np.int16(c1[j]) - q1)
+            a2, a3 = np.int16(np.int16(c2[j]) - q2), np.int16(np.int16(c3[j]) - q3)
+            low = np.int32(np.int32(np.uint16(a0 * a0)) + np.int32(np.uint16(a1 * a1)))
+            high = np.int32(np.int32(np.uint16(a2 * a2)) + np.int32(np.uint16(a3 * a3)))
+            part[j] += np.int32(np.int32(low + high) << by)
+    least = np.int32(FAR)
+    for j in range(count):
+        least = min(least, part[j])
+    return least
+
+
+@njit(cache=True, nogil=True)
+def rest_sum(row: Any, query: Any, lead: int, shifts: Any) -> int:
+    """The squared differences of one node in the groups after the lead."""
+    total = np.int32(0)
+    for g in range(lead, shifts.shape[0]):
+        part = np.int32(0)
+        for d in range(GROUP):
+            away = np.int32(np.int32(row[g * GROUP + d]) - np.int32(query[g * GROUP + d]))
+            part += np.int32(away * away)
+        total += np.int32(part << np.int32(shifts[g]))
+    return total
+
+
+@njit(cache=True, nogil=True)
+def nearest_bounded(
+    nodes: Any,
+    count: int,
+    query: Any,
+    centre: Any,
+    axes: Any,
+    origin: Any,
+    steps: Any,
+    shifts: Any,
+    columns: Any,
+    rows: Any,
+    errors: Any,
+    sums: Any,
+    in_question: Any,
+    lead: int,
+    best: int,
+    best_squared: float,
+) -> Any:
+    """(number, squared distance, nodes bounded further, nodes read) of the nearest node.
+
+    centre .. errors: as code_all takes and makes them.  shifts: (groups,), steps[g] = steps.min() * 2^(shifts[g] / 2),
+    so that sums are in units of the smallest step squared.  sums, in_question: (capacity,) int32, work.  lead: groups
+    that are summed for all nodes; the others only where the lead leaves a chance.  best, best_squared: a node already
+    known, or -1 and inf.
+    """
+    groups, blocks = steps.shape[0], (count + BLOCK - 1) // BLOCK
+    own = np.empty(axes.shape[1], dtype=np.uint8)
+    slack = np.empty(groups)
+    code(query, centre, axes, origin, steps, own, slack)
+    unit = steps.min()
+    for g in range(groups):
+        slack[g] += errors[g] + GUARD
+    least = np.empty(blocks, dtype=np.int32)
+    start = 0
+    for b in range(blocks):
+        least[b] = lead_sums(columns[b], own, lead, shifts, sums[b * BLOCK : min((b + 1) * BLOCK, count)])
+        if least[b] < least[start]:
+            start = b
+    for j in range(start * BLOCK, count):
+        if sums[j] == least[start]:  # the likeliest of all before the others, for a low limit
+            squared = squared_up_to(nodes[j], query, best_squared)
+            if squared < best_squared or (squared == best_squared and j < best):
+                best, best_squared = j, squared
+            break
+    limit = sum_limit(best_squared, unit, slack[lead - 1])
+    bounded, likeliest = 0, 0
+    for b in range(blocks):
+        if least[b] > limit:
+            continue
+        for j in range(b * BLOCK, min((b + 1) * BLOCK, count)):
+            if sums[j] <= limit:  # those in question gather at the front, where the lead's sums are read already
+                in_question[bounded] = j
+                sums[bounded] = sums[j] + rest_sum(rows[j], own, lead, shifts)
+                if sums[bounded] < sums[likeliest]:
+                    likeliest = bounded
+                bounded += 1
+    read = 1
+    for turn in range(-1, bounded):
+        place = likeliest if turn < 0 else turn
+        if bounded == 0 or turn == likeliest or sums[place] > sum_limit(best_squared, unit, slack[groups - 1]):
+            continue
+        number = in_question[place]
+        squared = squared_up_to(nodes[number], query, best_squared)
+        read += 1
+        if squared < best_squared or (squared == best_squared and number < best):
+            best, best_squared = number, squared
+    return best, best_squared, bounded, read
+
+
+@njit(cache=True, nogil=True)
+def sum_limit(squared: float, unit: float, slack: float) -> int:
+    """The largest sum of codes that a node can have whose squared distance is at most `squared`."""
+    if not np.isfinite(squared):
+        return FAR
+    reach = (np.sqrt(squared) + slack) / unit
+    return np.int64(min(reach * reach + 1.0, 1.0 * FAR))

@@ -1,0 +1,1 @@
+"""Topological maps: nodes and edges instead of coordinates (S41 to S43)."""
