@@ -2,7 +2,7 @@
 
 Two ways to read less, both exact. Marks: a bit for each node, dimension and interval; the bits that are set in all
 dimensions are the candidates. Bounds: each node as a few bytes whose distance, scaled, is never above the true one;
-only nodes whose bound is low enough are read in full. All arrays are C-contiguous; nodes (capacity, n) float64.
+only nodes whose bound is low enough are looked at further. All arrays are C-contiguous; nodes (capacity, n) float64.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from numba import njit
 
 WORD = 64  # nodes in a word of marks
 BLOCK = 1024  # nodes whose sums stay in the first-level cache while all directions are added
+LARGEST = 127.0  # code: seven bits, see lead_sums
 GROUP = 8  # directions that are added at a time
 MOST_SHIFT = 8  # of a group's squares: sums of 16 groups stay below FAR
 FAR = 1 << 30  # above every sum
-GUARD = 1e-9  # for the rounding of 64-bit numbers in the rotation
+GUARD = 1e-4  # distance; far above what 32-bit coordinates and sums in up to 100 directions are off
 
 
 @njit(cache=True, nogil=True)
@@ -124,24 +125,31 @@ def bit_number(single: Any) -> int:
 
 
 @njit(cache=True, nogil=True)
-def code(vector: Any, centre: Any, axes: Any, origin: Any, steps: Any, codes: Any, errors: Any) -> None:
-    """A vector as one byte a direction, and how far that is off, summed up to each group of directions.
-
-    axes: (n, m) column by column the directions; m = GROUP * groups, padded with zeros.  origin: (m,) of the box.
-    steps: (groups,).  codes: (m,) uint8, written.  errors: (groups,), written: length of the rounding error in the
-    directions up to this group; clipping is not counted, it brings no two vectors farther apart.
-    """
-    coordinates = np.zeros(codes.shape[0])
+def turn(vector: Any, centre: Any, axes: Any, row: Any) -> None:
+    """A vector's coordinates in the principal directions. axes: (n, m), a direction a column.  row: (m,) float32."""
+    coordinates = np.zeros(row.shape[0])
     for r in range(vector.shape[0]):
         away = vector[r] - centre[r]
-        for d in range(codes.shape[0]):
+        for d in range(row.shape[0]):
             coordinates[d] += away * axes[r, d]
+    for d in range(row.shape[0]):
+        row[d] = np.float32(coordinates[d])
+
+
+@njit(cache=True, nogil=True)
+def code(row: Any, origin: Any, steps: Any, codes: Any, errors: Any) -> None:
+    """Coordinates as seven bits a direction, and how far that is off, summed up to each group of directions.
+
+    origin: (m,) of the box, m = GROUP * groups.  steps: (groups,).  codes: (m,) uint8, written.  errors: (groups,),
+    written: length of the rounding error in the directions up to this group; clipping is not counted, it brings no
+    two vectors farther apart.
+    """
     squared = 0.0
     for d in range(codes.shape[0]):
         step = steps[d // GROUP]
-        inside = min(max((coordinates[d] - origin[d]) / step, 0.0), 255.0)
+        inside = min(max((row[d] - origin[d]) / step, 0.0), LARGEST)
         whole = np.floor(inside + 0.5)
-        codes[d] = np.uint8(min(whole, 255.0))
+        codes[d] = np.uint8(whole)
         squared += ((inside - whole) * step) ** 2
         errors[d // GROUP] = np.sqrt(squared)
 
@@ -159,15 +167,18 @@ def code_all(
     rows: Any,
     errors: Any,
 ) -> None:
-    """Code the nodes first .. last - 1, twice: columns (blocks, m, BLOCK) and rows (capacity, m), both uint8.
+    """Turn and code the nodes first .. last - 1.
 
-    errors: (groups,), raised where these nodes are rounded more than any before.
+    rows: (capacity, m) float32, their coordinates.  columns: (blocks, m, BLOCK) uint8, their codes.  errors:
+    (groups,), raised where these nodes are rounded more than any before.
     """
+    codes = np.empty(rows.shape[1], dtype=np.uint8)
     off = np.empty(errors.shape[0])
     for j in range(first, last):
-        code(nodes[j], centre, axes, origin, steps, rows[j], off)
-        for d in range(rows.shape[1]):
-            columns[j // BLOCK, d, j % BLOCK] = rows[j, d]
+        turn(nodes[j], centre, axes, rows[j])
+        code(rows[j], origin, steps, codes, off)
+        for d in range(codes.shape[0]):
+            columns[j // BLOCK, d, j % BLOCK] = codes[d]
         for g in range(errors.shape[0]):
             errors[g] = max(errors[g], off[g])
 
@@ -176,20 +187,27 @@ def code_all(
 def lead_sums(columns: Any, query: Any, lead: int, shifts: Any, part: Any) -> Any:
     """Squared differences of the first `lead` groups of the nodes of a block, into part; the least of them.
 
-    columns: (m, BLOCK).  part: (nodes,) int32.  Four directions at a time, in 16-bit lanes: a third faster than one.
+    columns: (m, BLOCK).  part: (nodes,) int32.  Four squares of 7-bit numbers fit in 16 bits, of which a vector
+    register holds twice as many as of 32: this is what the codes leave their eighth bit unused for.
     """
     count = part.shape[0]
     part[:] = 0
-    for d in range(0, lead * GROUP, 4):
+    for d in range(0, lead * GROUP, 8):
         by = np.int32(shifts[d // GROUP])
         c0, c1, c2, c3 = columns[d], columns[d + 1], columns[d + 2], columns[d + 3]
+        c4, c5, c6, c7 = columns[d + 4], columns[d + 5], columns[d + 6], columns[d + 7]
         q0, q1, q2, q3 = np.int16(query[d]), np.int16(query[d + 1]), np.int16(query[d + 2]), np.int16(query[d + 3])
+        q4, q5, q6, q7 = np.int16(query[d + 4]), np.int16(query[d + 5]), np.int16(query[d + 6]), np.int16(query[d + 7])
         for j in range(count):
             a0, a1 = np.int16(np.int16(c0[j]) - q0), np.int16(np.int16(c1[j]) - q1)
             a2, a3 = np.int16(np.int16(c2[j]) - q2), np.int16(np.int16(c3[j]) - q3)
-            low = np.int32(np.int32(np.uint16(a0 * a0)) + np.int32(np.uint16(a1 * a1)))
-            high = np.int32(np.int32(np.uint16(a2 * a2)) + np.int32(np.uint16(a3 * a3)))
-            part[j] += np.int32(np.int32(low + high) << by)
+            a4, a5 = np.int16(np.int16(c4[j]) - q4), np.int16(np.int16(c5[j]) - q5)
+            a6, a7 = np.int16(np.int16(c6[j]) - q6), np.int16(np.int16(c7[j]) - q7)
+            low = np.uint16(np.uint16(np.uint16(a0 * a0) + np.uint16(a1 * a1)) + np.uint16(a2 * a2))
+            low = np.uint16(low + np.uint16(a3 * a3))
+            high = np.uint16(np.uint16(np.uint16(a4 * a4) + np.uint16(a5 * a5)) + np.uint16(a6 * a6))
+            high = np.uint16(high + np.uint16(a7 * a7))
+            part[j] += np.int32(np.int32(np.int32(low) + np.int32(high)) << by)
     least = np.int32(FAR)
     for j in range(count):
         least = min(least, part[j])
@@ -197,15 +215,15 @@ def lead_sums(columns: Any, query: Any, lead: int, shifts: Any, part: Any) -> An
 
 
 @njit(cache=True, nogil=True)
-def rest_sum(row: Any, query: Any, lead: int, shifts: Any) -> int:
-    """The squared differences of one node in the groups after the lead."""
-    total = np.int32(0)
-    for g in range(lead, shifts.shape[0]):
-        part = np.int32(0)
-        for d in range(GROUP):
-            away = np.int32(np.int32(row[g * GROUP + d]) - np.int32(query[g * GROUP + d]))
-            part += np.int32(away * away)
-        total += np.int32(part << np.int32(shifts[g]))
+def squared_row(row: Any, query: Any, limit: float) -> Any:
+    """Squared distance of two (m,) float32 rows; inf as soon as it is above the limit: the widest directions first."""
+    total = np.float32(0.0)
+    for first in range(0, row.shape[0], GROUP):
+        for d in range(first, first + GROUP):
+            away = row[d] - query[d]
+            total += away * away
+        if total > limit:
+            return np.inf
     return total
 
 
@@ -224,63 +242,70 @@ def nearest_bounded(
     errors: Any,
     sums: Any,
     in_question: Any,
+    nearness: Any,
     lead: int,
     best: int,
     best_squared: float,
 ) -> Any:
-    """(number, squared distance, nodes bounded further, nodes read) of the nearest node.
+    """(number, squared distance, nodes in question, nodes read) of the nearest node.
 
     centre .. errors: as code_all takes and makes them.  shifts: (groups,), steps[g] = steps.min() * 2^(shifts[g] / 2),
-    so that sums are in units of the smallest step squared.  sums, in_question: (capacity,) int32, work.  lead: groups
-    that are summed for all nodes; the others only where the lead leaves a chance.  best, best_squared: a node already
+    so that sums are in units of the smallest step squared.  sums, in_question (int32), nearness (float64):
+    (capacity,), work.  lead: groups that are summed for all nodes; those not ruled out by it are in question and
+    compared by their rows, and read only if rounding to 32 bits leaves a doubt.  best, best_squared: a node already
     known, or -1 and inf.
     """
-    groups, blocks = steps.shape[0], (count + BLOCK - 1) // BLOCK
+    blocks = (count + BLOCK - 1) // BLOCK
+    row = np.empty(axes.shape[1], dtype=np.float32)
     own = np.empty(axes.shape[1], dtype=np.uint8)
-    slack = np.empty(groups)
-    code(query, centre, axes, origin, steps, own, slack)
-    unit = steps.min()
-    for g in range(groups):
-        slack[g] += errors[g] + GUARD
+    slack = np.empty(steps.shape[0])
+    turn(query, centre, axes, row)
+    code(row, origin, steps, own, slack)
+    unit, off = steps.min(), slack[lead - 1] + errors[lead - 1] + GUARD
     least = np.empty(blocks, dtype=np.int32)
     start = 0
     for b in range(blocks):
         least[b] = lead_sums(columns[b], own, lead, shifts, sums[b * BLOCK : min((b + 1) * BLOCK, count)])
         if least[b] < least[start]:
             start = b
+    near = best_squared  # squared distance of the nearest so far, by rows
     for j in range(start * BLOCK, count):
         if sums[j] == least[start]:  # the likeliest of all before the others, for a low limit
-            squared = squared_up_to(nodes[j], query, best_squared)
-            if squared < best_squared or (squared == best_squared and j < best):
-                best, best_squared = j, squared
+            near = min(near, squared_row(rows[j], row, np.inf))
             break
-    limit = sum_limit(best_squared, unit, slack[lead - 1])
-    bounded, likeliest = 0, 0
+    limit = sum_limit(near, unit, off)
+    found = 0
     for b in range(blocks):
         if least[b] > limit:
             continue
         for j in range(b * BLOCK, min((b + 1) * BLOCK, count)):
-            if sums[j] <= limit:  # those in question gather at the front, where the lead's sums are read already
-                in_question[bounded] = j
-                sums[bounded] = sums[j] + rest_sum(rows[j], own, lead, shifts)
-                if sums[bounded] < sums[likeliest]:
-                    likeliest = bounded
-                bounded += 1
-    read = 1
-    for turn in range(-1, bounded):
-        place = likeliest if turn < 0 else turn
-        if bounded == 0 or turn == likeliest or sums[place] > sum_limit(best_squared, unit, slack[groups - 1]):
-            continue
-        number = in_question[place]
-        squared = squared_up_to(nodes[number], query, best_squared)
-        read += 1
-        if squared < best_squared or (squared == best_squared and number < best):
-            best, best_squared = number, squared
-    return best, best_squared, bounded, read
+            if sums[j] > limit:
+                continue
+            squared = squared_row(rows[j], row, widened(near))
+            in_question[found], nearness[found] = j, squared
+            found += 1
+            if squared < near:
+                near = squared
+                limit = sum_limit(near, unit, off)
+    read = 0
+    for place in range(found):
+        if nearness[place] <= widened(near):
+            number = in_question[place]
+            squared = squared_up_to(nodes[number], query, best_squared)
+            read += 1
+            if squared < best_squared or (squared == best_squared and number < best):
+                best, best_squared = number, squared
+    return best, best_squared, found, read
 
 
 @njit(cache=True, nogil=True)
-def sum_limit(squared: float, unit: float, slack: float) -> int:
+def widened(squared: float) -> Any:
+    """The square of a distance that is longer by GUARD on both sides."""
+    return (np.sqrt(squared) + 2.0 * GUARD) ** 2
+
+
+@njit(cache=True, nogil=True)
+def sum_limit(squared: float, unit: float, slack: float) -> Any:
     """The largest sum of codes that a node can have whose squared distance is at most `squared`."""
     if not np.isfinite(squared):
         return FAR

@@ -6,9 +6,10 @@ Two structures are kept beside the nodes, both updated node by node:
   stands, as bits, which nodes have a component within reach D of it. A node nearer than D is marked in all
   dimensions, so if none is, none is that near. With k such that an interval is D wide this is the book's
   (q - 1) .. (q + 2); narrower intervals, the default, leave fewer candidates for the same number of bits read.
-- Bounds: the nodes in their principal directions, the rest of each vector as one length, in 8 bits a number. Neither
-  the rotation, nor dropping directions for a length, nor clipping makes two vectors farther apart, and the error of
-  rounding is known: what remains is a bound below the distance. A node is read in full only if its bound is low.
+- Bounds: the nodes turned into their principal directions, in seven bits a number, the widest directions first.
+  Turning changes no distance; leaving directions out and clipping make none longer; the error of rounding is known:
+  what remains is a bound below the distance. Few nodes are still in question after that; these are compared by their
+  turned coordinates, and read in full where rounding those to 32 bits leaves a doubt.
 
 Neither helps for every kind of data (uniform random vectors in 48 dimensions defeat both: everything is equally far),
 so both are watched by counting, never by a clock, and the cheaper way is taken: marks, few directions, more of them,
@@ -29,6 +30,7 @@ from mapping.kernels import topology as kernels
 F64 = NDArray[np.float64]
 
 FLAT_BELOW = 256  # nodes; fewer are read faster than bounded
+MOST_DIRECTIONS = 100  # dimensions; for more, rounding is not proven to stay below kernels.GUARD
 MOST_INTERVAL_BITS = 5
 _WATCHED = 64  # queries between two decisions
 _MANY_IN_QUESTION, _FEW_IN_QUESTION = (
@@ -48,8 +50,8 @@ class Effort:
     by_bounds: int = 0
     flat: int = 0
     candidates: int = 0  # of the interval index, summed
-    bounded: int = 0  # nodes still in question after their first directions, summed
-    read: int = 0  # nodes read in full after all bounds, summed
+    in_question: int = 0  # nodes that the bounds did not rule out, summed
+    read: int = 0  # nodes read in full, summed
 
 
 class NearestNodes:
@@ -161,8 +163,8 @@ class NearestNodes:
             number, least = kernels.nearest_flat(self._nodes, self._count, query)
             return int(number), float(least)
         self.effort.by_bounds += 1
-        number, least, bounded, read = self._bounds.nearest(self._nodes, self._count, query, best, squared)
-        self.effort.bounded += bounded
+        number, least, in_question, read = self._bounds.nearest(self._nodes, self._count, query, best, squared)
+        self.effort.in_question += in_question
         self.effort.read += read
         return number, least
 
@@ -218,7 +220,7 @@ class _Marks:
 
 
 class _Bounds:
-    """Nodes in their principal directions, a byte each, for sums that are below the distances.
+    """Nodes in their principal directions, seven bits each, for sums that are below the distances.
 
     Directions come in groups of eight, the widest first; a group has a step of its own, the smallest times a power of
     two, so that narrow directions are rounded less. `errors` holds, up to each group, the longest rounding error of
@@ -238,13 +240,16 @@ class _Bounds:
         self._shifts: NDArray[np.int64] = np.zeros(groups, dtype=np.int64)
         self._errors: F64 = np.zeros(groups)
         self._columns: NDArray[np.uint8] = np.zeros((0, width, kernels.BLOCK), dtype=np.uint8)
-        self._rows: NDArray[np.uint8] = np.zeros((0, width), dtype=np.uint8)
+        self._rows: NDArray[np.float32] = np.zeros((0, width), dtype=np.float32)
         self._sums: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
         self._in_question: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
-        self._asked = self._bounded = 0
+        self._nearness: F64 = np.zeros(0)
+        self._asked = self._in_question_sum = 0
 
     def put(self, nodes: F64, count: int, number: int) -> None:
         """Node `number` has been added or moved. The directions are found anew whenever the nodes have doubled."""
+        if self._n > MOST_DIRECTIONS:
+            return
         if count >= max(FLAT_BELOW, 2 * self._built_at):
             self._build(nodes, count)
         elif self.lead:
@@ -252,25 +257,25 @@ class _Bounds:
             self._encode(nodes, number, number + 1)
 
     def nearest(self, nodes: F64, count: int, query: F64, best: int, squared: float) -> tuple[int, float, int, int]:
-        """Number, squared distance, nodes bounded further, nodes read. best, squared: one known, or -1 and inf."""
-        number, least, bounded, read = kernels.nearest_bounded(
+        """Number, squared distance, nodes in question, nodes read. best, squared: one known, or -1 and inf."""
+        number, least, in_question, read = kernels.nearest_bounded(
             nodes, count, query, self._centre, self._axes, self._origin, self._steps, self._shifts, self._columns,
-            self._rows, self._errors, self._sums, self._in_question, self.lead, best, squared,
+            self._rows, self._errors, self._sums, self._in_question, self._nearness, self.lead, best, squared,
         )  # fmt: skip
         self._asked += 1
-        self._bounded += bounded
+        self._in_question_sum += in_question
         if self._asked == _WATCHED // 4:
             self._look_back(count)
-        return int(number), float(least), int(bounded), int(read)
+        return int(number), float(least), int(in_question), int(read)
 
     def _look_back(self, count: int) -> None:
         """One group more for all nodes if too many were in question after the lead, one less if hardly any."""
-        in_question = self._bounded / self._asked / count
+        in_question = self._in_question_sum / self._asked / count
         if in_question > _MANY_IN_QUESTION:
             self.lead = min(self.lead + 1, len(self._steps))
         elif in_question < _FEW_IN_QUESTION:
             self.lead = max(self.lead - 1, 1)
-        self._asked = self._bounded = 0
+        self._asked = self._in_question_sum = 0
 
     def _build(self, nodes: F64, count: int) -> None:
         self._built_at = count
@@ -296,6 +301,7 @@ class _Bounds:
             self._columns = np.pad(self._columns, ((0, blocks), (0, 0), (0, 0)))
             self._sums = np.zeros(capacity, dtype=np.int32)
             self._in_question = np.zeros(capacity, dtype=np.int32)
+            self._nearness = np.zeros(capacity)
 
     def _encode(self, nodes: F64, first: int, last: int) -> None:
         kernels.code_all(
@@ -308,7 +314,7 @@ def _steps(widths: F64) -> tuple[F64, NDArray[np.int64]]:
     """Steps of groups as wide as told, and how far their squares are shifted against those of the smallest."""
     widths = np.maximum(widths, 1e-9)
     halvings = np.minimum(np.floor(np.log2(widths.max() / widths)), kernels.MOST_SHIFT // 2)
-    return float(widths.max()) / 255.0 / 2.0**halvings, (2 * (halvings.max() - halvings)).astype(np.int64)
+    return float(widths.max()) / kernels.LARGEST / 2.0**halvings, (2 * (halvings.max() - halvings)).astype(np.int64)
 
 
 def _grown(array: NDArray[Any], *, axis: int) -> NDArray[Any]:

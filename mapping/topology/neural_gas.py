@@ -220,7 +220,8 @@ class FritzkeGas:
         """(n,) of a living node; KeyError if it does not live."""
         if number not in self._ages:
             raise KeyError(f"no node {number}")
-        return self._nodes[number].copy()
+        vector: F64 = self._nodes[number].copy()
+        return vector
 
     @property
     def edges(self) -> list[tuple[int, int]]:
@@ -299,4 +300,5 @@ def flat_picture(vectors: ArrayLike) -> F64:
     two = np.zeros((net.shape[1], 2))
     two[:, : min(2, net.shape[1])] = axes[:, ::-1][:, :2]
     two *= np.where(two[np.argmax(np.abs(two), axis=0), [0, 1]] < 0.0, -1.0, 1.0)
-    return away @ two
+    drawn: F64 = away @ two
+    return drawn

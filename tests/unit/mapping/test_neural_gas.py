@@ -132,7 +132,8 @@ def test_marks_miss_no_node_within_reach(
     best, squared, candidates = net._marks.nearest(net._nodes, len(table), vector, len(table))
     number, distance = brute(table, vector)
     if distance <= reach:
-        assert (best, squared) == (number, pytest.approx(distance**2))
+        assert best == number
+        assert squared == pytest.approx(distance**2)
     boxed = np.all(np.abs(table - vector) <= reach, axis=1)
     assert candidates >= int(boxed.sum())
 
@@ -142,7 +143,10 @@ def test_equals_go_to_the_first() -> None:
         net = NearestNodes(2, reach=0.1)
         for _ in range(count):
             net.add([0.5, 0.5])
-        assert net.nearest([0.52, 0.5]) == (0, pytest.approx(0.02))
+        found = net.nearest([0.52, 0.5])
+        assert found is not None
+        assert found[0] == 0
+        assert found[1] == pytest.approx(0.02)
 
 
 def test_bad_input() -> None:
@@ -223,8 +227,11 @@ def test_steps_of_the_algorithm() -> None:
     assert gas.total == 4
     assert gas.learn([0.9]).node == 2
     assert gas.match([0.51]) is None
-    assert gas.match([0.31]) == (1, pytest.approx(0.01))
-    assert gas.nearest([0.55]) == (1, pytest.approx(0.25))
+    matched, near = gas.match([0.31]), gas.nearest([0.55])
+    assert matched is not None
+    assert near is not None
+    assert (matched[0], near[0]) == (1, 1)
+    assert (matched[1], near[1]) == (pytest.approx(0.01), pytest.approx(0.25))
 
 
 def test_same_vector_for_ever_is_one_node() -> None:
@@ -323,7 +330,7 @@ def test_fritzke_step_by_step() -> None:
             gas.learn(vector)
     for wrong in ({"shift": 1.5}, {"oldest": 0}, {"max_nodes": 1}):
         with pytest.raises(ValueError):
-            FritzkeRules(**wrong)  # type: ignore[arg-type]
+            FritzkeRules(**wrong)
 
 
 # --- figures
