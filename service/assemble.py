@@ -52,9 +52,11 @@ from service.sensors import Chain, Laser, Sensor, Transducer, Wheels
 if TYPE_CHECKING:
     from drivers.encoder_arduino_bridge import ArduinoBridgeConversation
     from drivers.mavlink_in import MavlinkConversation
+    from service.background import Submit
     from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
     from service.map_makers import MapMaker
     from service.mavlink_out import MavlinkOut
+    from service.redraw import OnRedrawn
 
 
 @dataclass(frozen=True, slots=True)
@@ -530,9 +532,30 @@ def parts(config: Config, found: Mapping[str, Sensor], made: Maps, localiser: Lo
     )
 
 
-def localiser(config: Config, start_pose: Pose2) -> Localiser:
-    """What says where the odom frame lies in the map; the same for a daemon and for a replay of what it recorded."""
-    return OdometryOnly(start_pose)
+def localiser(
+    config: Config,
+    found: Mapping[str, Sensor],
+    made: Maps,
+    start_pose: Pose2,
+    submit: Submit,
+    on_redrawn: OnRedrawn | None = None,
+) -> Localiser:
+    """What says where the odom frame lies in the map; the same for a daemon and for a replay of what it recorded.
+
+    submit: where slow work is done.  on_redrawn: see Redrawer.
+    """
+    lasers = {name: sensor.base_from_sensor for name, sensor in found.items() if isinstance(sensor, Laser)}
+    matched = lasers.keys() & _sources(config, config.slam.sources, found)
+    if not config.slam.enabled or not matched:
+        return OdometryOnly(start_pose)
+    from service.redraw import Redrawer
+    from service.slam_live import SlamLocaliser
+
+    redrawer = Redrawer(made.grids, made.building, lasers, submit=submit)
+    if made.building is not None:
+        redrawer.start_over(made.building.grid.tiles())
+    redrawer.on_redrawn = on_redrawn or redrawer.on_redrawn
+    return SlamLocaliser(matched, start=start_pose, submit=submit, redrawer=redrawer)
 
 
 def geometry_of(drive: Drive) -> DriveGeometry:
@@ -608,6 +631,10 @@ def warm_up(config: Config) -> None:
         from mapping.lines.warm_up import warm_up as warm_up_lines
 
         warm_up_lines()
+    if config.slam.enabled and any(isinstance(sensor, Laser) for sensor in found.values()):
+        from mapping.localise.warm_up import warm_up as warm_up_slam
+
+        warm_up_slam()
     fusion = Fusion(parts(config, found, maps(config, found), OdometryOnly()))
     now_ns = 0
     for step in range(4):  # standing, then moving: the two take different kernels

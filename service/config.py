@@ -20,7 +20,7 @@ from service.config_base import Name, Section
 from service.config_devices import SHARED_DRIVERS, CanBus, Device, Drive, LaserDevice, Robot, SonarDevice, WheelDevice
 from service.config_faults import Fault, faults_of, without_faults
 from service.config_files import KeyPath, Layers, find_config, origin_of, read_layers
-from service.config_maps import Alignment, Artos, Grid, LineMapSettings, LocalGrid, SectorMaps
+from service.config_maps import Alignment, Artos, Grid, LineMapSettings, LocalGrid, SectorMaps, SlamLive
 from service.errors import WrongUsage
 
 SENSOR_SECTIONS = ("lasers", "sonars")
@@ -41,6 +41,7 @@ class Config(Section):
     local_grid: LocalGrid = Field(default=LocalGrid(), description="The grid around the robot.")
     artos: Artos = Field(default=Artos(), description="The ARTOS two-step map.")
     lines: LineMapSettings = Field(default=LineMapSettings(), description="The map of walls as lines.")
+    slam: SlamLive = Field(default=SlamLive(), description="Where the robot is, by laser scans.")
     alignment: Alignment = Field(default=Alignment(), description="How long readings wait for each other.")
     network: Network = Field(default=Network(), description="The Zenoh router.")
     ros: Ros = Field(default=Ros(), description="ROS 2 beside our own keys.")
@@ -232,6 +233,7 @@ def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
         *((("sectors", "rect", name), table) for name, table in _tables(data, "sectors", "rect")),
         (("grid",), _table(data, "grid")),
         (("local_grid",), _table(data, "local_grid")),
+        (("slam",), _table(data, "slam")),
     ):
         for reference in _texts(table.get("sources")):
             section, dot, name = reference.rpartition(".")

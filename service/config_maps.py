@@ -104,6 +104,15 @@ class LineMapSettings(Section):
     min_scans: int = Field(default=2, ge=1, le=255, description="Scans that must have seen a line before it is told.")
 
 
+class SlamLive(Section):
+    """Where the robot is: found by laying laser scans on each other, not by the wheels alone."""
+
+    enabled: bool = Field(
+        default=True, description="Do it, on a robot with a laser; false: believe the wheels, however they drift."
+    )
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Lasers that are matched; default: all.")
+
+
 class Alignment(Section):
     """How long readings wait for each other."""
 

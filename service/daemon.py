@@ -1,7 +1,8 @@
 """The daemon: which threads there are, in which order they start and stop, and that the process always ends.
 
     wires (one thread each) --> fusion thread --> publisher's threads        keeper thread --> store
-                                     \\--> maps thread --^
+                        |            \\--> maps thread --^
+                        +--> background threads: closing loops, drawing anew after a correction
     main thread: waits for a signal
 
 Start: the map's file, the kernels (warm before a port is opened, or the first scans would wait for them), the router,
@@ -32,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 from drivers.reader import WireReader
 from mapping.frames import IDENTITY, Pose2
 from service import assemble, health, recording
+from service.background import Background
 from service.clock import Clock, SystemClock
 from service.config import Config, Loaded
 from service.errors import Trouble
@@ -51,6 +53,7 @@ from service.worker import Worker
 from service.zenoh_session import NetworkSettings, TlsFiles
 
 if TYPE_CHECKING:
+    from service.layers import BuildingLayer
     from service.mavlink_out import MavlinkOut
 
 log = logging.getLogger(__name__)
@@ -141,7 +144,12 @@ class Daemon:
         )
         if store is not None:
             self._makers.restore(store.load_tiles)
-        parts = assemble.parts(config, self._sensors, maps, assemble.localiser(config, start_pose or IDENTITY))
+        background = Background()
+        self._parts.callback(self._stop_background, background)
+        localiser = assemble.localiser(
+            config, self._sensors, maps, start_pose or IDENTITY, background.submit, self._makers.redraw
+        )
+        parts = assemble.parts(config, self._sensors, maps, localiser)
         if sources := self._makers.sources:
             parts = replace(parts, grids=(*parts.grids, SweepTap(self._makers, sources)))
         self._fusion = RecordedFusion(parts)
@@ -157,7 +165,7 @@ class Daemon:
         self._live_map = None
         if maps.building is not None:
             self._live_map = LiveMap(
-                maps.building, store, ask=self._worker.ask, pose=self._fusion.pose, makers=self._makers
+                maps.building, store, ask=self._worker.ask, fusion=self._fusion, makers=self._makers
             )
             self._publisher.calls.register_map_service(self._live_map)
             self._parts.callback(self._finish_map, self._live_map)
@@ -272,10 +280,14 @@ class Daemon:
             return {"recording": False}
         building, end = self._building, {}
         if building is not None:
-            end = self._worker.ask(lambda: {"map_sha256": recording.digest_of(building.grid)})
+            end = self._worker.ask(partial(self._digest, building))
         done = self._recorder.end(end) or {"recording": False}
         log.info("recorded: %s", ", ".join(done.get("files", ())))
         return done
+
+    def _digest(self, building: BuildingLayer) -> dict[str, str]:
+        self._fusion.drain()
+        return {"map_sha256": recording.digest_of(building.grid)}
 
     def _other_troubles(self) -> list[str]:
         troubles = (self._recorder.trouble(), None if self._mavlink is None else self._mavlink.trouble())
@@ -313,6 +325,9 @@ class Daemon:
 
     def _stop_makers(self) -> None:
         self._note(self._makers.stop(_FUSION_STOP_S))
+
+    def _stop_background(self, background: Background) -> None:
+        self._note(background.stop(_FUSION_STOP_S))
 
     def _finish_map(self, live_map: LiveMap) -> None:
         try:

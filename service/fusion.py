@@ -4,7 +4,8 @@ outputs bit for bit.
 A laser's sweep goes three ways. As it is: ScanOut. At once into the sector maps, de-skewed with the odometry known by
 then; where odometry has not reached the last beams yet the newest pose is held, because a sector map that waits is
 late (at 100 Hz odometry the hold is 10 ms at most, 1 cm at 1 m/s). And into the grids, where a wrong place stays
-wrong for ever: there it waits until odometry covers the whole sweep, at most `wait_ns`, and is dropped otherwise.
+wrong for long: there it waits until odometry covers the whole sweep, at most `wait_ns`, and is dropped otherwise; then
+the localiser sees it before it is drawn. While the localiser waits for a result, scans are held back; the pose is not.
 
 Input never stops fusion. What cannot be used is dropped and counted by source and reason:
     stamp_equal, stamp_backward, stamp_ahead    not newer than the source's last, or from the future
@@ -19,6 +20,7 @@ Input never stops fusion. What cannot be used is dropped and counted by source a
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
@@ -46,6 +48,7 @@ _BEAMS_MAX = 100_000
 _SECTOR_PERIOD_NS = 50_000_000  # a sector map is published so often even if nothing feeds it
 _SECTOR_GAP_NS = 20_000_000  # sonars that follow each other faster are published together, with the next tick
 _POSE_PERIOD_NS = 25_000_000
+_HELD_MAX = 512  # scans and rounds that are held back for a localiser that is late; beyond, fusion waits for it
 _TOO_FAST_IN_A_ROW = 5  # then the counts are believed, and what lay between them is unknown
 _STALE_LIMIT_NS = 500_000_000
 SECTOR_MEMORY_NS = _STALE_LIMIT_NS - _SECTOR_PERIOD_NS
@@ -109,17 +112,56 @@ class GridLayer(Protocol):
         """What is due for publication at now_ns. map_from_base: where the robot is, None while unknown."""
 
 
+@dataclass(frozen=True, slots=True)
+class Located:
+    """Where the base is in the map. covariance: (3, 3) of map_from_base.  map_from_odom: the correction behind it."""
+
+    stamp_ns: int
+    map_from_base: Pose2
+    map_from_odom: Pose2
+    covariance: F64
+
+
 class Localiser(Protocol):
-    """Where the odom frame lies in the map frame. Scan matching and SLAM take this seam."""
+    """Where the odom frame lies in the map frame: odometry alone, SLAM, or a known map.
+
+    All calls come from the fusion thread, in the order of what is measured. What it says depends on these calls alone,
+    so that a replay is told the same; what it works out elsewhere it takes up at a moment that stamps decide.
+    """
+
+    def is_ready(self, stamp_ns: int) -> bool:
+        """Whether take_scan of this stamp would not have to wait for something; while not, scans are held back."""
 
     def take_odometry(self, state: OdometryState) -> None:
         """Each new state, in order."""
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> None:
-        """Each sweep that odometry covers, in order of stamps, before it is put into the grids."""
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
+        """Each sweep that odometry covers, in order of stamps, before it is put into the grids. odom_from_base: None on
+        a robot without odometry, whose odom frame is then its base."""
 
-    def map_from_odom(self) -> tuple[Pose2, F64]:
-        """The correction as of now and its covariance (3, 3)."""
+    def take_round(self, source: str, heard: Round, odom_from_base: Pose2) -> None:
+        """Each round of sonars that is put into the grids."""
+
+    def map_from_odom(self) -> Pose2:
+        """The correction as of now."""
+
+    def locate(self, state: OdometryState) -> Located:
+        """The base at the newest odometry."""
+
+    def located(self) -> Located | None:
+        """The base at the newest scan, of a robot without odometry; None if scans say nothing about it."""
+
+    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
+        """Another map was loaded, these tiles; the pose stays until scans say otherwise."""
+
+    def outputs(self, now_ns: int) -> list[Output]:
+        """What is due for publication at now_ns."""
+
+    def troubles(self) -> list[str]:
+        """What is wrong, each in one line with the repair."""
+
+    def counters(self) -> Mapping[str, int]:
+        """Its figures, by name."""
 
 
 class OdometryOnly:
@@ -128,14 +170,44 @@ class OdometryOnly:
     def __init__(self, map_from_odom: Pose2 = IDENTITY) -> None:
         self._map_from_odom = map_from_odom
 
+    def is_ready(self, stamp_ns: int) -> bool:
+        return True
+
     def take_odometry(self, state: OdometryState) -> None:
         """Nothing to learn from it."""
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> None:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
         """Nothing to learn from it."""
 
-    def map_from_odom(self) -> tuple[Pose2, F64]:
-        return self._map_from_odom, np.zeros((3, 3))
+    def take_round(self, source: str, heard: Round, odom_from_base: Pose2) -> None:
+        """Nothing to learn from it."""
+
+    def map_from_odom(self) -> Pose2:
+        return self._map_from_odom
+
+    def locate(self, state: OdometryState) -> Located:
+        return located_by_odometry(self._map_from_odom, state)
+
+    def located(self) -> Located | None:
+        return None
+
+    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
+        """The robot is where it was."""
+
+    def outputs(self, now_ns: int) -> list[Output]:
+        return []
+
+    def troubles(self) -> list[str]:
+        return []
+
+    def counters(self) -> Mapping[str, int]:
+        return {}
+
+
+def located_by_odometry(map_from_odom: Pose2, state: OdometryState) -> Located:
+    """The base where odometry has it, the correction taken as exact."""
+    covariance = compose_covariance(map_from_odom, np.zeros((3, 3)), state.odom_from_base, state.covariance)
+    return Located(state.stamp_ns, map_from_odom @ state.odom_from_base, map_from_odom, covariance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +251,7 @@ class Fusion:
         self._sectors_untold: set[int] = set()  # changed since they were published
         self._newest_stamp_ns = 0
         self._late_since_ns: int | None = None
+        self._held: deque[tuple[str, Scan | Round]] = deque()  # covered, until the localiser is ready
 
     # --- what comes in
 
@@ -215,6 +288,8 @@ class Fusion:
             if index in self._sectors_untold or self._told_since_ns(index, now_ns) >= _SECTOR_PERIOD_NS
         ]
         self.settle(now_ns)
+        outputs.extend(self._pose_by_scans())
+        outputs.extend(self._parts.localiser.outputs(now_ns))
         map_from_base = self._map_from_base_now()
         for grid in self._parts.grids:
             outputs.extend(grid.outputs(map_from_base, self._newest_stamp_ns, now_ns))
@@ -222,17 +297,21 @@ class Fusion:
 
     def counters(self) -> dict[str, int]:
         """Figures of fusion itself."""
-        return {"fusion.waiting_for_odometry": len(self._waiting)}
+        return {
+            "fusion.waiting_for_odometry": len(self._waiting),
+            "fusion.held_back": len(self._held),
+            **self._parts.localiser.counters(),
+        }
 
     def troubles(self, now_ns: int) -> list[str]:
         """What fusion waits for or lacks, each in one line with the repair."""
+        troubles = self._parts.localiser.troubles()
         drive = self._parts.drive
-        if drive is None:
-            moving = any(grid.sources for grid in self._parts.grids)
-            return ["no [drive] source: the grid is drawn as if the robot stood still"] if moving else []
-        if self._late_since_ns is not None:
-            return [f"grids wait for odometry of {drive[0]}: check that device; scans are not drawn meanwhile"]
-        return []
+        if drive is None and self._parts.localiser.located() is None and any(g.sources for g in self._parts.grids):
+            troubles.append("no [drive] source: the grid is drawn as if the robot stood still")
+        elif drive is not None and self._late_since_ns is not None:
+            troubles.append(f"grids wait for odometry of {drive[0]}: check that device; scans are not drawn meanwhile")
+        return troubles
 
     def pose(self) -> Pose2 | None:
         """The base in the map frame, None before the first odometry."""
@@ -371,16 +450,18 @@ class Fusion:
         return max(abs(left_m), abs(right_m)) > reach_m + slack_m
 
     def _pose_of(self, state: OdometryState) -> PoseOut:
-        map_from_odom, covariance = self._parts.localiser.map_from_odom()
-        return PoseOut(
-            state.stamp_ns,
-            map_from_odom @ state.odom_from_base,
-            map_from_odom,
-            compose_covariance(map_from_odom, covariance, state.odom_from_base, state.covariance),
-        )
+        return _pose_out(self._parts.localiser.locate(state))
+
+    def _pose_by_scans(self) -> list[Output]:
+        """Of a robot without odometry."""
+        located = None if self._odometry is not None else self._parts.localiser.located()
+        if located is None or located.stamp_ns == self._pose_told_ns:
+            return []
+        self._pose_told_ns = located.stamp_ns
+        return [_pose_out(located)]
 
     def _map_from_base_now(self) -> Pose2 | None:
-        map_from_odom, _ = self._parts.localiser.map_from_odom()
+        map_from_odom = self._parts.localiser.map_from_odom()
         if self._odometry is None:
             return map_from_odom
         return None if self._state is None else map_from_odom @ self._state.odom_from_base
@@ -393,6 +474,7 @@ class Fusion:
         Apart from it so that sector maps leave before the slower grids are worked on.
         """
         if not len(self._waiting):
+            self._draw_held(patience=_HELD_MAX)
             return
         if self._odometry is None:
             released = self._waiting.release(oldest_ns=-_FOREVER_NS, newest_ns=_FOREVER_NS, now_ns=now_ns)
@@ -404,8 +486,27 @@ class Fusion:
             self._drop(source, reason)
             if reason == "odometry_late":
                 self._late_since_ns = self._late_since_ns or now_ns
-        for source, value in released.ready:
+        if released.ready:
             self._late_since_ns = None
+        self._held.extend(released.ready)
+        self._draw_held(patience=_HELD_MAX)
+
+    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
+        """The building's grid holds these stored tiles now; the robot's pose stays."""
+        self._parts.localiser.map_was_replaced(tiles)
+
+    def drain(self) -> None:
+        """Draw what is held back, waiting for whatever it is held back for."""
+        self._draw_held(patience=0)
+
+    def _draw_held(self, *, patience: int) -> None:
+        """Draw in order, up to a scan that the localiser is not ready for; with more than `patience` it waits there."""
+        while self._held:
+            source, value = self._held[0]
+            is_ready = isinstance(value, Round) or self._parts.localiser.is_ready(value.stamp_ns)
+            if not is_ready and len(self._held) <= patience:
+                return
+            self._held.popleft()
             try:
                 self._draw(source, value)
             except GoneError:
@@ -427,20 +528,25 @@ class Fusion:
         localiser = self._parts.localiser
         if isinstance(value, Round):
             odom_from_base = self._poses.at(value.stamp_ns)
-            self._insert_round(source, value, localiser.map_from_odom()[0] @ odom_from_base)
+            localiser.take_round(source, value, odom_from_base)
+            self._insert_round(source, value, localiser.map_from_odom() @ odom_from_base)
             return
         base_from_sensor = self._laser(source).base_from_sensor
         odom_from_bases = self._poses.at_many(beam_stamps(value))
         localiser.take_scan(source, value, self._poses, base_from_sensor)
-        map_from_base = compose_many(localiser.map_from_odom()[0], odom_from_bases)
+        map_from_base = compose_many(localiser.map_from_odom(), odom_from_bases)
         self._insert_sweep(source, value, carry(map_from_base, base_from_sensor))
 
     def _draw_standing(self, source: str, value: Scan | Round) -> None:
-        map_from_base, _ = self._parts.localiser.map_from_odom()
+        """Without odometry: where the localiser has it, by scans alone."""
+        localiser = self._parts.localiser
         if isinstance(value, Round):
-            self._insert_round(source, value, map_from_base)
+            localiser.take_round(source, value, IDENTITY)
+            self._insert_round(source, value, localiser.map_from_odom())
             return
-        pose = map_from_base @ self._laser(source).base_from_sensor
+        base_from_sensor = self._laser(source).base_from_sensor
+        localiser.take_scan(source, value, None, base_from_sensor)
+        pose = localiser.map_from_odom() @ base_from_sensor
         self._insert_sweep(source, value, np.array([pose.x_m, pose.y_m, pose.yaw_rad]))
 
     def _laser(self, source: str) -> Laser:
@@ -599,6 +705,10 @@ def carry(a_from_b: F64, b_from_c: Pose2) -> F64:
 def stale_after_ns(period_ns: int, sweep_ns: int) -> int:
     """How old evidence may be, from its stamp: three periods after its sweep ended, never more than 500 ms."""
     return min(3 * period_ns + sweep_ns, _STALE_LIMIT_NS) if period_ns > 0 else _STALE_LIMIT_NS
+
+
+def _pose_out(located: Located) -> PoseOut:
+    return PoseOut(located.stamp_ns, located.map_from_base, located.map_from_odom, located.covariance)
 
 
 def _last_beam_ns(scan: Scan) -> int:

@@ -167,7 +167,7 @@ class BuildingLayer:
         return [GridUpdateOut(stamp_ns, self._epoch, change) for change in changes if self._is_inside(change)]
 
     def start_anew(self) -> None:
-        """The grid was replaced: what was sent so far no longer holds."""
+        """The grid was replaced, or moved: what was sent so far no longer holds, the next output is a whole grid."""
         self._full, self._unsent, self._outgrown = None, True, True
 
     def _is_full_due(self, now_ns: int) -> bool:
@@ -218,6 +218,11 @@ class RollingLayer:
         insert_round(self.grid, source, heard, map_from_base)
         self._changed = True
 
+    def start_over(self) -> None:
+        """Forget the window: the map frame moved under it."""
+        self.grid.clear()
+        self._changed = True
+
     def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
         if not self._changed or (self._told_ns is not None and now_ns - self._told_ns < self._period_ns):
             return []
@@ -237,6 +242,10 @@ class ArtosLayer:
         self._period_ns = period_ns
         self._drawn_ns: int | None = None
         self._epoch = 0
+
+    def start_over(self) -> None:
+        """Forget the window: the map frame moved under it."""
+        self.grid.clear()
 
     def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
         raise AssertionError("the two-step map is drawn from sector maps")

@@ -35,6 +35,19 @@ class Ask(Protocol):
     def __call__(self, work: Callable[[], T], /) -> T: ...
 
 
+class Drawing(Protocol):
+    """What draws the grid: Fusion."""
+
+    def pose(self) -> Pose2 | None:
+        """Where the robot is in the map."""
+
+    def drain(self) -> None:
+        """Draw what is held back."""
+
+    def map_was_replaced(self, tiles: Iterable[Tile]) -> None:
+        """The grid holds these stored tiles now."""
+
+
 class LiveMap:
     """One building's grid and the store behind it. Calls may come from any thread."""
 
@@ -44,15 +57,15 @@ class LiveMap:
         store: MapStore | None,
         *,
         ask: Ask,
-        pose: Callable[[], Pose2 | None],
+        fusion: Drawing,
         makers: MapMakers | None = None,
     ) -> None:
-        """pose: where the robot is in the map, asked where the grid may be touched.  makers: kept too."""
+        """fusion: draws the grid, and knows where the robot is; touched where `ask` runs.  makers: kept too."""
         self._layer = layer
         self._store = store
         self._queue = None if store is None else SnapshotQueue(store)
         self._ask = ask
-        self._pose = pose
+        self._fusion = fusion
         self._makers = makers
 
     # --- while running
@@ -61,7 +74,7 @@ class LiveMap:
         """Write what changed since the last one; False if the disk refused (it is tried again with the next)."""
         if self._queue is None:
             return True
-        changed, pose = self._ask(lambda: (self._layer.grid.changed_tiles(), self._pose()))
+        changed, pose = self._ask(lambda: (self._layer.grid.changed_tiles(), self._fusion.pose()))
         if changed:
             self._queue.offer(GRID, ((tile.tile_row, tile.tile_col, tile.payload()) for tile in changed))
             self._queue.offer(OCCUPANCY, occupancy_of(changed), self._meta(pose))
@@ -80,6 +93,7 @@ class LiveMap:
 
     def finish(self) -> None:
         """The last snapshot, and a whole copy as the newest generation."""
+        self._ask(self._fusion.drain)
         if self._store is not None and self.snapshot():
             self._store.keep_generation()
 
@@ -117,12 +131,17 @@ class LiveMap:
             raise CallRefused(f"{path}: holds no grid to go on with; `umfeld map import` makes one from a picture")
         self._check_tiles(path, tiles)
         self.snapshot()  # so that nothing older waits behind what is written next
-        self._ask(lambda: replace_tiles(self._layer, tiles))
+        self._ask(lambda: self._replace(tiles))
         meta = self._meta(None)
         if self._makers is not None:
             self._makers.restore(lambda name: made[name])
         store.snapshot({GRID: tiles, OCCUPANCY: ready_made, **made}, meta, replace=True)
         return {"name": name, "path": str(path), "tiles": len(tiles)}
+
+    def _replace(self, tiles: list[Tile]) -> None:
+        self._fusion.drain()
+        replace_tiles(self._layer, tiles)
+        self._fusion.map_was_replaced(tiles)
 
     def _check_tiles(self, path: Path, tiles: Iterable[Tile]) -> None:
         """Load them aside first: the live map is replaced as a whole or not at all."""

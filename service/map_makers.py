@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +94,14 @@ class MapMaker(Protocol):
         """Take up what changed_tiles gave out earlier; begin empty if there is nothing. ValueError if it is damaged."""
 
 
+@runtime_checkable
+class DrawnFromSweeps(Protocol):
+    """A maker whose map is made of posed sweeps, which it cannot move by itself when the map is corrected."""
+
+    def start_anew(self) -> None:
+        """Forget the map: every sweep that was kept follows, where it lies now."""
+
+
 @dataclass(slots=True)
 class _Desk:
     """What the thread remembers of one maker."""
@@ -114,6 +122,7 @@ class MapMakers:
         self._offer = offer
         self._now_ns = now_ns
         self._sweeps: deque[Sweep] = deque()
+        self._redrawn: Sequence[Callable[[], Sweep]] | None = None
         self._grids: deque[GridOut | GridUpdateOut] = deque()
         self._asked: deque[tuple[Callable[[], object], threading.Event, list[object]]] = deque()
         self._changed = threading.Condition()
@@ -155,6 +164,12 @@ class MapMakers:
             if len(self._sweeps) > SWEEPS_WAITING_MAX:
                 self._sweeps.popleft()
                 self.counts["makers.sweeps_lost"] += 1
+
+    def redraw(self, sweeps: Sequence[Callable[[], Sweep]]) -> None:
+        """The map was corrected: these are the sweeps it is made of, where they lie now. Never blocks."""
+        with self._changed:
+            self._redrawn = sweeps
+            self._sweeps.clear()  # those that were kept are among them
 
     def take_output(self, output: Output) -> None:
         """Everything that is published passes here; grids and poses are of use. Never blocks."""
@@ -226,12 +241,17 @@ class MapMakers:
             sweeps, self._sweeps = self._sweeps, deque()
             grids, self._grids = self._grids, deque()
             asked, self._asked = self._asked, deque()
+            redrawn, self._redrawn = self._redrawn, None
         for work, done, result in asked:
             try:
                 result.extend((None, work()))
             except BaseException as error:  # it belongs to the thread that asked
                 result.extend((error, None))
             done.set()
+        for desk in self._desks:
+            if redrawn is not None and isinstance(desk.maker, DrawnFromSweeps):
+                desk.is_fed = True
+                self._guard(desk, partial(_draw_anew, desk.maker, redrawn))
         for output in grids:
             self._note(self._mirror.take(output))
         for desk in self._desks:
@@ -270,6 +290,15 @@ class MapMakers:
             if kind not in self._complained and len(self._complained) < 100:
                 self._complained.add(kind)
                 log.exception("internal error in a map maker: %s", kind)
+
+
+def _draw_anew(maker: MapMaker, sweeps: Sequence[Callable[[], Sweep]]) -> None:
+    assert isinstance(maker, DrawnFromSweeps)
+    maker.start_anew()
+    for make in sweeps:
+        source, scan, map_from_sensor = make()
+        if source in maker.sources:
+            maker.take_sweep(source, scan, map_from_sensor)
 
 
 class SweepTap:

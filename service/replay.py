@@ -26,6 +26,7 @@ from drivers.recording import WirePlayer, WireRecord, decode_record
 from mapping.frames import Pose2
 from mapping.grids.occupancy import OccupancyGrid
 from service import assemble
+from service.background import at_once
 from service.clock import CrankedClock
 from service.config import Config, check
 from service.config_files import Layers
@@ -285,7 +286,7 @@ class Replay:
         maps = assemble.maps(self.config, found)
         self._building = maps.building
         self._load_map()
-        localiser = assemble.localiser(self.config, Pose2(*self.head.start.pose))
+        localiser = assemble.localiser(self.config, found, maps, Pose2(*self.head.start.pose), at_once)
         self.fusion = Fusion(assemble.parts(self.config, found, maps, localiser))
         self._waiting: dict[str, deque[Reading | DeviceEvent]] = {}
         self._next_tick_ns = self.head.begun_ns
@@ -329,6 +330,7 @@ class Replay:
         report.sent = sum(player.sent for player in self._players.values())
         report.sent_otherwise = sum(player.sent_otherwise for player in self._players.values())
         report.errors += sum(player.bugs for player in self._players.values())
+        self.fusion.drain()
         if self.grid is not None:
             report.digest = digest_of(self.grid)
         live = (self.recording.end or {}).get("map_sha256")

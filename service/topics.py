@@ -16,6 +16,7 @@ JSON_HEALTH = "application/json;umfeld.health.v1"
 JSON_INFO = "application/json;umfeld.info.v1"
 JSON_GRID = "application/json;umfeld.grid.v1"
 JSON_LINES = "application/json;umfeld.lines.v1"
+JSON_GRAPH = "application/json;umfeld.graph.v1"
 JSON_REPLY = "application/json;umfeld.reply.v1"
 
 _CHUNK = re.compile(r"[a-z0-9_-]+\Z")
@@ -217,6 +218,16 @@ MAP_LINES = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+MAP_GRAPH = Topic(
+    "map/graph",
+    "umfeld.graph.v1",
+    JSON_GRAPH,
+    "at most 1 Hz, on change",
+    "Where the robot came along, and which places it saw again; from a daemon that does SLAM.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 HEALTH = Topic(
     "health",
     DIAGNOSTICS,
@@ -271,6 +282,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_LOCAL,
     MAP_ARTOS,
     MAP_LINES,
+    MAP_GRAPH,
     HEALTH,
     HEALTH_JSON,  # before health/<sensor>: the exact key wins
     HEALTH_ONE,

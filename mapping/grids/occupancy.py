@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -220,6 +220,48 @@ class OccupancyGrid(EvidenceGrid):
             sound = bool(np.all((cells == 0) | (np.abs(cells.astype(np.int64) - kernels.ODDS_ZERO) <= 8000)))
         if not sound:
             raise ValueError("a stored grid tile holds impossible cells")
+
+    def places(self) -> list[tuple[int, int]]:
+        """(tile row, tile column) of every tile, in order of rows."""
+        return [(int(row), int(col)) for row, col in self._pool.tile_at[self._pool.slots()]]
+
+    def empty_copy(self) -> OccupancyGrid:
+        """A grid of the same kind that knows nothing."""
+        return OccupancyGrid(
+            resolution_m=self.resolution_m,
+            model=self.model,
+            rules=self.rules,
+            sonar_rules=self._sonar_rules,
+            fill_gap_m=self._fill_gap_m,
+            use_max_m=self._use_max_m,
+            max_tiles=self._pool.max_tiles,
+        )
+
+    def take_tiles(self, other: OccupancyGrid, places: Iterable[tuple[int, int]]) -> None:
+        """Replace whole tiles by those of another grid of the same kind; what it does not know there is unknown then.
+
+        They count as changed, for publishing and for the store. Raises ValueError if the grids differ in kind.
+        """
+        if other.model != self.model or other.resolution_m != self.resolution_m:
+            raise ValueError("tiles are taken from a grid of the same model and resolution only")
+        theirs = {tuple(other._pool.tile_at[slot].tolist()): int(slot) for slot in other._pool.slots()}
+        ours = {tuple(self._pool.tile_at[slot].tolist()) for slot in self._pool.slots()}
+        for place in places:
+            source = theirs.get(place)
+            if source is None and place not in ours:
+                continue
+            slot = self._pool.slot_for(*place)
+            if slot == 0:
+                continue  # no room: it stays unknown, and is counted
+            self._pool.cells_of_slot(slot)[:] = 0 if source is None else other._pool.cells_of_slot(source)
+            with_sonar = source is not None and bool(other._pool.sonar_seen[source])
+            if with_sonar or self._pool.sonar_seen[slot]:
+                self._pool.need_sonar()
+                self._pool.sonar_of_slot(slot)[:] = (
+                    other._pool.sonar_of_slot(source) if with_sonar and source is not None else 0
+                )
+                self._pool.sonar_seen[slot] = with_sonar
+            self._pool.flags[slot] = 0xFF
 
     def clear(self) -> None:
         """Forget everything; the next changes say so."""

@@ -69,6 +69,11 @@ class RollingGrid(EvidenceGrid):
             self._forget_outside(int(slot))
         self._lay_table()
 
+    def clear(self) -> None:
+        """Forget everything in the window."""
+        for slot in self._pool.slots():
+            self._pool.drop(int(slot))
+
     def patch(self) -> GridPatch:
         """The whole window, always the same shape."""
         return self._patch_of(self._window)

@@ -184,18 +184,24 @@ class _Trust:
 class Slam:
     """See the module's text. Lasers are told apart by the name given with their scans."""
 
-    def __init__(self, settings: SlamSettings | None = None, *, start: Pose2 | None = None) -> None:
+    def __init__(
+        self, settings: SlamSettings | None = None, *, start: Pose2 | None = None, keep_scans: bool = True
+    ) -> None:
+        """start: the base at the first scan; by default where odometry has it.  keep_scans: remember where every scan
+        was, for trajectory(); a robot that drives for days keeps key scans only."""
         self.settings = settings if settings is not None else SlamSettings()
         self.epoch = 0
         self.events: Counter[str] = Counter()
         self.closures: tuple[Closure, ...] = ()
         self.closure_weight: F64 = np.zeros(0)
         self._start = start
+        self._keep_scans = keep_scans
         self._sensors: dict[str, _Sensor] = {}
         self._views = ViewStore()
         self._poses: F64 = np.zeros((64, 3))  # map_from_sensor of key scans
         self._travel: F64 = np.zeros(64)
         self._base_from_sensor: list[Pose2] = []
+        self._sensor_from_base: list[tuple[float, float, float]] = []
         self._key_stamps: list[int] = []
         self._path: list[tuple[Pose2, F64]] = []  # measured, information: key k to k + 1
         self._pending: tuple[Closure, ...] = ()
@@ -215,6 +221,12 @@ class Slam:
         self._unoptimised = 0
         self._next_number = 0
         self._handed_out = False
+
+    def begin_at(self, map_from_base: Pose2) -> None:
+        """Where the base is at the first scan, said before it is added."""
+        if self._last is not None:
+            raise RuntimeError("the first scan was added already")
+        self._start = map_from_base
 
     # --- scans
 
@@ -383,6 +395,8 @@ class Slam:
         self._poses[key] = (pose.x_m, pose.y_m, pose.yaw_rad)
         self._sensors[sensor].last_key = key
         self._base_from_sensor.append(base_from_sensor)
+        sensor_from_base = base_from_sensor.inverse()
+        self._sensor_from_base.append((sensor_from_base.x_m, sensor_from_base.y_m, sensor_from_base.yaw_rad))
         self._key_stamps.append(stamp_ns)
         odom_from_sensor = None if odom is None else odom @ base_from_sensor
         if key > 0:
@@ -429,9 +443,10 @@ class Slam:
         self._last = (stamp_ns, map_from_base, odom)
         key_pose = self._key_pose(key)
         in_key = key_pose.inverse() @ map_from_base
-        self._stamps.append(stamp_ns)
-        self._scan_key.append(key)
-        self._scan_in_key.append((in_key.x_m, in_key.y_m, in_key.yaw_rad))
+        if self._keep_scans:
+            self._stamps.append(stamp_ns)
+            self._scan_key.append(key)
+            self._scan_in_key.append((in_key.x_m, in_key.y_m, in_key.yaw_rad))
         covariance = self._key_covariance
         if not is_key and match is not None:
             held = floored(turned_information(match.information(), -key_pose.yaw_rad), 0.005, math.radians(0.1))
@@ -472,7 +487,8 @@ class Slam:
             self._outstanding = Work(self._snapshot(tuple(range(self._looked_at, n))), self.settings.closures)
             self._looked_at = n
             lag_s = self.settings.lag_s + self.settings.lag_s_per_key * n
-            self._due_ns = self._stamps[-1] + round(lag_s * 1e9)
+            assert self._last is not None
+            self._due_ns = self._last[0] + round(lag_s * 1e9)
             self._handed_out = False
         if self._outstanding is None or self._handed_out:
             return None
@@ -509,6 +525,10 @@ class Slam:
         self.events.update(result.events)
         self._outstanding = None
 
+    def abandon(self) -> None:
+        """Give up the work that was handed out: its key scans stay without closures of their own."""
+        self._outstanding = None
+
     def _grown(self, covariance: F64, key: int) -> F64:
         """Covariance of the newest key scan from that of an earlier one, along the path."""
         for k in range(key, len(self._views) - 1):
@@ -522,6 +542,10 @@ class Slam:
             self._views.arrays(), self._poses[:n].copy(), self._travel[:n].copy(), self._path_edges(), self.closures,
             self._pending, keys, self._unoptimised, self._next_number, thorough,
         )  # fmt: skip
+
+    def snapshot(self) -> Snapshot:
+        """What is known, as a piece of work would see it."""
+        return self._snapshot(())
 
     def _path_edges(self) -> Edges:
         n = len(self._path)
@@ -608,7 +632,7 @@ class Slam:
         return self._views.memory_bytes
 
     def trajectory(self) -> tuple[I64, F64]:
-        """Stamps (N,) and base poses (N, 3) of all scans, as the map stands now."""
+        """Stamps (N,) and base poses (N, 3) of all scans, as the map stands now; none without keep_scans."""
         if not self._stamps:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
         keys = np.array(self._scan_key)
@@ -623,10 +647,28 @@ class Slam:
         """When key scans were taken."""
         return tuple(self._key_stamps)
 
+    @property
+    def last_pose(self) -> Pose2 | None:
+        """Base pose at the last scan, as the map stands now; None before the first."""
+        return None if self._last is None else self._last[1]
+
+    def key_pose(self, key: int) -> Pose2:
+        """Base pose of one key scan."""
+        return self._key_pose(key) @ self._base_from_sensor[key].inverse()
+
+    def step_covariance(self, step: Pose2) -> F64:
+        """(3, 3) of a motion by odometry, as far as it is trusted by now."""
+        sigma_m, sigma_rad = self._odometry_sigma(math.hypot(step.x_m, step.y_m), abs(step.yaw_rad))
+        return np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])
+
+    @property
+    def lost_scans(self) -> int:
+        """How many scans in a row fitted nothing."""
+        return self._lost_scans
+
     def key_poses(self) -> F64:
         """(K, 3) base poses of key scans."""
-        mounts = np.array([_row(p.inverse()) for p in self._base_from_sensor]).reshape(-1, 3)
-        return composed_poses(self._poses[: len(self._views)], mounts)
+        return composed_poses(self._poses[: len(self._views)], np.array(self._sensor_from_base).reshape(-1, 3))
 
 
 def run_here(slam: Slam, stamp_ns: int, result: WorkResult | None) -> WorkResult | None:

@@ -70,6 +70,11 @@ class ArtosMap:
             for one in snapshots:
                 self._draw(one, map_from_base @ one.base_from_sensor, step)
 
+    def clear(self) -> None:
+        """Forget everything."""
+        self._counters[:] = 0
+        self._touched[:] = False
+
     def patch(self) -> GridPatch:
         """The window as a grid in map cells: -1 never touched, else 50 per cent and the counter's share of 50."""
         cells = np.floor(50.5 + 50.0 * self._counters / self._counter_max).astype(np.int8)

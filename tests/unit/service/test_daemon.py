@@ -7,7 +7,8 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -197,8 +198,25 @@ def store(tmp_path: Path) -> Iterator[MapStore]:
         yield opened
 
 
+@dataclass
+class Standing:
+    """A robot that stands at a place."""
+
+    at: Pose2 | None
+    replaced_by: list[tuple[int, int, bytes]] = field(default_factory=list)
+
+    def pose(self) -> Pose2 | None:
+        return self.at
+
+    def drain(self) -> None:
+        pass
+
+    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
+        self.replaced_by = list(tiles)
+
+
 def live(layer: BuildingLayer, store: MapStore | None, pose: Pose2 | None = None) -> LiveMap:
-    return LiveMap(layer, store, ask=lambda work: work(), pose=lambda: pose)
+    return LiveMap(layer, store, ask=lambda work: work(), fusion=Standing(pose))
 
 
 def test_a_map_comes_back_as_it_was_left_and_the_robot_where_it_stood(store: MapStore) -> None:

@@ -1,0 +1,252 @@
+"""SLAM as the daemon's localiser: every scan is laid on the last key scans at once, loops are closed beside.
+
+    take_scan: what is due is taken up --> match --> kept for redrawing --> drawn by fusion
+                   ^ by stamps alone         |
+                   +-- closures, pose graph <+-- background (mapping.localise.slam says what it does)
+
+The pose never waits: between scans it is odometry on top of the last correction. A scan is passed over while the robot
+has not moved enough since the last one to say anything new (odometry tells). Which scans are matched, and when results
+are taken up, depends on stamps and odometry alone: a replay makes the same map, bit for bit.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.deskew import beam_stamps, deskew
+from mapping.frames import IDENTITY, Pose2, compose_covariance
+from mapping.localise.closures import WorkResult
+from mapping.localise.slam import Slam, SlamSettings, SlamUpdate
+from mapping.odometry import OdometryState
+from mapping.pose_buffer import PoseBuffer
+from mapping.scan import Scan
+from service.background import Submit
+from service.fusion import Located, Round, compose_many, located_by_odometry
+from service.outputs import DocumentOut, Output
+from service.redraw import Redrawer
+
+log = logging.getLogger(__name__)
+
+F64 = NDArray[np.float64]
+
+KEY = "map/graph"
+MATCH_M = 0.02
+MATCH_RAD = math.radians(1.0)
+MATCH_NS = 250_000_000  # so often at least while it moves
+STILL_M = 1e-3
+STILL_RAD = 1e-3
+MATCH_STILL_NS = 1_000_000_000
+DOUBT_SCANS = 20  # in a row that fit nothing: then it is said
+_GRAPH_PERIOD_NS = 1_000_000_000
+_KEYS_A_SECOND = 2_000  # larger graphs are sent more seldom
+
+
+class SlamLocaliser:
+    """See the module's docstring and fusion.Localiser."""
+
+    def __init__(
+        self,
+        sources: Iterable[str],
+        *,
+        start: Pose2 = IDENTITY,
+        submit: Submit,
+        redrawer: Redrawer | None = None,
+        settings: SlamSettings | None = None,
+    ) -> None:
+        """sources: lasers that are matched.  start: map_from_odom before the first scan.  submit: where closures are
+        looked for.  redrawer: draws the map again after a correction."""
+        self._sources = frozenset(sources)
+        self._settings = settings
+        self._slam = Slam(settings, keep_scans=False)
+        self._submit = submit
+        self._redrawer = redrawer
+        self._work: Future[WorkResult] | None = None
+        self._map_from_odom = start
+        self._matched: dict[str, tuple[int, Pose2]] = {}  # stamp and odometry of each laser's last match
+        self._update: SlamUpdate | None = None
+        self._update_odom = IDENTITY
+        self._has_odometry = False
+        self._is_broken = False
+        self._told_ns: int | None = None
+        self._told: tuple[int, int, int] | None = None
+        self._counts = {"slam.scans": 0, "slam.scans_passed": 0, "slam.scans_unordered": 0, "slam.work_errors": 0}
+
+    # --- what fusion asks
+
+    def is_ready(self, stamp_ns: int) -> bool:
+        late = self._slam.is_due(stamp_ns) and self._work is not None and not self._work.done()
+        return not late and (self._redrawer is None or self._redrawer.is_ready(stamp_ns))
+
+    def take_odometry(self, state: OdometryState) -> None:
+        self._has_odometry = True
+        self._is_broken |= state.broken
+
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
+        self._take_up(scan.stamp_ns)
+        if sensor in self._sources:
+            if odom_from_base is None:
+                self._match(sensor, scan, base_from_sensor, None)
+            else:
+                self._match_moving(sensor, scan, odom_from_base, base_from_sensor)
+        if self._redrawer is not None and self._update is not None and self._slam.keys:
+            key = self._slam.keys - 1
+            ends = self._ends(scan, odom_from_base)
+            self._redrawer.keep_sweep(sensor, scan, key, self._slam.key_pose(key), ends)
+
+    def take_round(self, source: str, heard: Round, odom_from_base: Pose2) -> None:
+        if self._redrawer is not None and self._slam.keys:
+            key = self._slam.keys - 1
+            pose = self._map_from_odom @ odom_from_base
+            self._redrawer.keep_round(source, heard, key, self._slam.key_pose(key), pose)
+
+    def map_from_odom(self) -> Pose2:
+        return self._map_from_odom
+
+    def locate(self, state: OdometryState) -> Located:
+        if self._update is None:
+            return located_by_odometry(self._map_from_odom, state)
+        step = self._update_odom.inverse() @ state.odom_from_base
+        covariance = compose_covariance(
+            self._map_from_odom @ self._update_odom, self._update.covariance, step, self._slam.step_covariance(step)
+        )
+        map_from_base = self._map_from_odom @ state.odom_from_base
+        return Located(state.stamp_ns, map_from_base, self._map_from_odom, covariance)
+
+    def located(self) -> Located | None:
+        if self._update is None or self._has_odometry:
+            return None
+        return Located(self._update.stamp_ns, self._map_from_odom, self._map_from_odom, self._update.covariance)
+
+    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
+        """Key scans belong to the map that is gone."""
+        self._slam = Slam(self._settings, keep_scans=False)
+        self._work, self._update, self._told = None, None, None
+        self._matched.clear()
+        if self._redrawer is not None:
+            self._redrawer.start_over(tiles)
+
+    def outputs(self, now_ns: int) -> list[Output]:
+        state = (self._slam.keys, self._slam.epoch, len(self._slam.closures))
+        if self._update is None or state == self._told:
+            return []
+        period_ns = max(_GRAPH_PERIOD_NS, self._slam.keys * _GRAPH_PERIOD_NS // _KEYS_A_SECOND)
+        if self._told_ns is not None and now_ns - self._told_ns < period_ns:
+            return []
+        self._told, self._told_ns = state, now_ns
+        return [DocumentOut(KEY, self._update.stamp_ns, graph_fields(self._slam))]
+
+    def troubles(self) -> list[str]:
+        if self._slam.lost_scans < DOUBT_SCANS:
+            return []
+        return [
+            f"{self._slam.lost_scans} scans in a row fit nothing seen before: the pose is odometry's meanwhile; "
+            "is the laser blinded, tilted or its mount in [lasers] wrong?"
+        ]
+
+    def counters(self) -> Mapping[str, int]:
+        slam = self._slam
+        return {
+            **self._counts,
+            "slam.key_scans": slam.keys,
+            "slam.closures": len(slam.closures),
+            "slam.corrections": slam.epoch,
+            **({} if self._redrawer is None else {**self._redrawer.counts, "map.kept_sweeps": self._redrawer.kept}),
+        }
+
+    @property
+    def slam(self) -> Slam:
+        """What it knows; not to be changed."""
+        return self._slam
+
+    # --- matching
+
+    def _match_moving(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> None:
+        stamps = beam_stamps(scan)
+        odom = odom_from_base.at(int(stamps[len(stamps) // 2]))
+        if self._says_nothing_new(sensor, scan.stamp_ns, odom):
+            self._counts["slam.scans_passed"] += 1
+            return
+        swept = replace(deskew(scan, odom_from_base, base_from_sensor).scan, stamp_ns=scan.stamp_ns)
+        if self._match(sensor, swept, base_from_sensor, odom):
+            self._matched[sensor] = (scan.stamp_ns, odom)
+
+    def _says_nothing_new(self, sensor: str, stamp_ns: int, odom: Pose2) -> bool:
+        if sensor not in self._matched or self._is_broken:
+            return False
+        matched_ns, matched = self._matched[sensor]
+        step = matched.inverse() @ odom
+        way, turn, waited_ns = math.hypot(step.x_m, step.y_m), abs(step.yaw_rad), stamp_ns - matched_ns
+        if way < STILL_M and turn < STILL_RAD:
+            return waited_ns < MATCH_STILL_NS
+        return way < MATCH_M and turn < MATCH_RAD and waited_ns < MATCH_NS
+
+    def _match(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2 | None) -> bool:
+        if self._update is not None and scan.stamp_ns <= self._update.stamp_ns:
+            self._counts["slam.scans_unordered"] += 1  # sweeps of two lasers that overlap
+            return False
+        if self._update is None:
+            self._slam.begin_at(self._map_from_odom @ (odom or IDENTITY))
+        seen_odom = None if self._is_broken else odom
+        self._update = self._slam.add_scan(scan, base_from_sensor, seen_odom, sensor=sensor)
+        self._is_broken = False
+        self._update_odom = odom or IDENTITY
+        self._map_from_odom = self._update.map_from_base @ self._update_odom.inverse()
+        self._counts["slam.scans"] += 1
+        work = self._slam.take_work()
+        if work is not None:
+            self._work = self._submit(work.run)
+        return True
+
+    def _ends(self, scan: Scan, odom_from_base: PoseBuffer | None) -> F64:
+        """(2, 3) base poses in the map at the first and the last beam."""
+        if odom_from_base is None:
+            pose = self._map_from_odom
+            return np.array([[pose.x_m, pose.y_m, pose.yaw_rad]] * 2)
+        stamps = beam_stamps(scan)
+        return compose_many(self._map_from_odom, odom_from_base.at_many(stamps[[0, -1]]))
+
+    # --- corrections
+
+    def _take_up(self, stamp_ns: int) -> None:
+        """Results that are due."""
+        if self._redrawer is not None and self._redrawer.is_due(stamp_ns):
+            self._redrawer.take_up(stamp_ns, self._slam.key_poses())
+        if not self._slam.is_due(stamp_ns) or self._work is None:
+            return
+        epoch = self._slam.epoch
+        try:
+            self._slam.apply(self._work.result())
+        except Exception:  # the map is as good as it was; later key scans get their chance
+            self._counts["slam.work_errors"] += 1
+            log.exception("internal error while looking for loops; these key scans stay without")
+            self._slam.abandon()
+        self._work = None
+        last = self._slam.last_pose
+        if last is not None:
+            self._map_from_odom = last @ self._update_odom.inverse()
+        if self._redrawer is not None and self._slam.epoch != epoch:
+            self._redrawer.corrected(stamp_ns, self._slam.key_poses())
+
+
+def graph_fields(slam: Slam) -> dict[str, object]:
+    """The document umfeld.graph.v1 but for its schema and stamp: where the robot came along, and which places it saw
+    again. Metres and radians, rounded to a millimetre and a milliradian."""
+    keys = [[round(float(v), 3) + 0.0 for v in pose] for pose in slam.key_poses()]
+    closures = [
+        {
+            "number": closure.number,
+            "from": closure.start,
+            "to": closure.to,
+            "weight": round(float(weight), 3),
+            "found": "searched" if closure.searched else "tracked",
+        }
+        for closure, weight in zip(slam.closures, slam.closure_weight)
+    ]
+    return {"frame": "map", "epoch": slam.epoch, "keys": keys, "closures": closures}
