@@ -135,7 +135,9 @@ class Daemon:
         self._publisher = self._make_publisher()
         self._parts.callback(self._close_publisher)
         self._publisher.add_tap(self._recorder.message)
-        starting = _in_thread("router", self._publisher.start)  # takes half a second, the kernels as much
+        starting = _in_thread(
+            "router", partial(self._publisher.start, announce=False)
+        )  # takes half a second, the kernels as much
         with _told_if_slow("compiling the kernels, as after each update: some 20 s"):
             assemble.warm_up(config)
         starting()
@@ -180,6 +182,7 @@ class Daemon:
         if config.recording.enabled:
             self._begin_recording(start_pose or IDENTITY, complete=True)
         self._publisher.publish_info(robot_info(config, self._wall_ns()))
+        self._publisher.announce()
         self._parts.callback(self._stop_makers)
         self._makers.start()
         self._worker.start()

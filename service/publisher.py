@@ -134,8 +134,11 @@ class Publisher:
         """Every message is also handed to tap, from the sending threads: a recording, for instance. Before start()."""
         self._taps.append(tap)
 
-    def start(self) -> None:
-        """Open the router and begin. PortInUse or NetworkTrouble if that cannot be."""
+    def start(self, *, announce: bool = True) -> None:
+        """Open the router and begin. PortInUse or NetworkTrouble if that cannot be.
+
+        announce: say that the robot is there; else announce() does, when it can answer every call.
+        """
         self._session = zenoh_session.open_router(self._network)
         if self._ros_settings is not None:
             self._ros = RosMirror(self._session, self._ros_settings)
@@ -144,6 +147,11 @@ class Publisher:
         for lane in Lane:
             self._spawn(f"publish-{lane.value}", self._send_loop, self._outboxes[lane])
         self._spawn("publish-answers", self._answer_loop)
+        if announce:
+            self.announce()
+
+    def announce(self) -> None:
+        """Put the liveliness token up."""
         self._token = self._session.liveliness().declare_token(f"{self.base}/{topics.ALIVE}")
 
     def _spawn(self, name: str, target: Callable[..., None], *arguments: object) -> None:

@@ -70,7 +70,7 @@ class KeptSweep:
 
 
 def kept_sweep(sensor: str, scan: Scan, *, key: int, in_key: F64, known_bearing_rad: F32 | None = None) -> KeptSweep:
-    """A sweep as it is kept. in_key: as in KeptSweep.  known_bearing_rad: of an earlier sweep, shared if it is the same.
+    """A sweep as it is kept. in_key: as in KeptSweep.  known_bearing_rad: of an earlier sweep, shared if it is equal.
 
     Ranges beyond FARTHEST_M are kept as nothing seen up to there.
     """

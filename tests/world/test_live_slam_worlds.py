@@ -92,7 +92,7 @@ def drive(name: str, laps: float, seed: int = 0) -> Drive:
     rng = np.random.default_rng(seed)
     items: list[tuple[int, str, Reading]] = []
     stamps = np.arange(0, round(laps * motion.lap_s * 1000), WHEELS_MS)
-    at = motion.pose_at(stamps * 1e-3)
+    at = motion.pose_at(stamps.astype(np.float64) * 1e-3)
     step = relative_poses(at[:-1], at[1:])
     turn = 1.04 * np.array([wrap_angle(float(v)) for v in step[:, 2]])
     way = 1.015 * np.hypot(step[:, 0], step[:, 1]) * np.sign(step[:, 0] + 1e-12)
@@ -104,7 +104,7 @@ def drive(name: str, laps: float, seed: int = 0) -> Drive:
         items.append((stamp * MS, "base", WheelReading(stamp * MS, int(ticks[0, k]), int(ticks[1, k]), True)))
     period_ns = SWEEP_MS * MS / len(BEARING)
     for stamp in range(SCAN_MS, int(stamps[-1]) - SCAN_MS, SCAN_MS):
-        beams_s = stamp * 1e-3 + np.arange(len(BEARING)) * period_ns * 1e-9
+        beams_s = stamp * 1e-3 + np.arange(len(BEARING), dtype=np.float64) * period_ns * 1e-9
         bases = motion.pose_at(beams_s)
         c, s = np.cos(bases[:, 2]), np.sin(bases[:, 2])
         origin = bases[:, :2] + np.stack((c * MOUNT.x_m - s * MOUNT.y_m, s * MOUNT.x_m + c * MOUNT.y_m), axis=-1)
