@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from service.files import Receipt
 
 app = typer.Typer()
 
@@ -45,12 +49,83 @@ def lines(
         typer.echo(geojson_bytes(found.lines, frame=found.frame).decode(), nl=False)
         return
     written = [write_lines(found.lines, path, frame=found.frame) for path in (out, _as_png(png)) if path is not None]
-    report = {**found.report, "files": [receipt.document() for receipt in written]}
-    if as_json:
-        typer.echo(json.dumps(report, indent=2))
+    _tell(found.report, written, as_json)
+
+
+@app.command()
+def planes(
+    file: Annotated[Path, typer.Argument(help="A cloud: .pcd, .ply, .xyz, .3d, or a depth image .png; plain or .gz.")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=".json or .ply; default: JSON to the screen.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw them, too.")] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="Calibration of a depth image; default: the one beside it.")
+    ] = None,
+    book: Annotated[
+        bool, typer.Option("--book", help="The book's algorithm 5.2 as it stands, not the refined.")
+    ] = False,
+    cell_m: Annotated[float, typer.Option(help="Edge of a cubic cell.")] = 0.2,
+    min_points: Annotated[int, typer.Option(help="Points of a cell, to look for a plane in it.")] = 10,
+    iterations: Annotated[int, typer.Option(help="Of RANSAC in a cell, at most.")] = 50,
+    inlier_m: Annotated[float, typer.Option(help="Farthest that a point of a plane is off.")] = 0.05,
+    angle_deg: Annotated[float, typer.Option(help="Between the normals of neighbouring cells.")] = 15.0,
+    apart_m: Annotated[float, typer.Option(help="From a cell's plane to its neighbour's centre of gravity.")] = 0.05,
+    min_cells: Annotated[
+        int, typer.Option(help="Supporting cells of a plane; the refined form: times min-points.")
+    ] = 10,
+    noise_m: Annotated[float | None, typer.Option(help="Noise of ranges; default: taken from the cloud.")] = None,
+    range_max_m: Annotated[float | None, typer.Option(help="Farther points are no echo.")] = None,
+    beam_deg: Annotated[float | None, typer.Option(help="Angle between beams: warns if cells are too small.")] = None,
+    seed: Annotated[int, typer.Option(help="Of RANSAC.")] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON; needs --out or --png.")] = False,
+) -> None:
+    """Planes of a point cloud: walls, floors, table tops, with their outlines.
+
+    Example: umfeld extract planes room.pcd --out planes.json --png planes.png
+    """
+    import math
+    from dataclasses import replace
+
+    from mapping.planes.extract import PlaneRules, RangeNoise
+    from service.errors import WrongUsage
+    from service.plane_files import json_bytes, planes_of_file, range_warning_of, write_planes
+
+    if as_json and out is None and png is None:
+        raise WrongUsage("--json reports on files: say where with --out or --png (without them the planes are printed)")
+    try:
+        rules = replace(
+            PlaneRules.book() if book else PlaneRules(),
+            cell_m=cell_m,
+            min_points=min_points,
+            iterations=iterations,
+            inlier_m=inlier_m,
+            angle_rad=math.radians(angle_deg),
+            apart_m=apart_m,
+            min_cells=min_cells,
+            seed=seed,
+        )
+        if noise_m is not None:
+            rules = replace(rules, noise=RangeNoise(noise_m))
+    except ValueError as error:
+        raise WrongUsage(str(error)) from error
+    found = planes_of_file(
+        file, rules=rules, camera=camera, range_max_m=math.inf if range_max_m is None else range_max_m
+    )
+    if beam_deg is not None and (warning := range_warning_of(found, rules, beam_deg)):
+        typer.echo(warning, err=True)
+    if out is None and png is None:
+        typer.echo(json_bytes(found.planes, frame="sensor").decode(), nl=False)
         return
-    for name, value in found.report.items():
-        typer.echo(f"{name:<16} {value}")
+    _tell(found.report, [write_planes(found, path) for path in (out, _as_png(png)) if path is not None], as_json)
+
+
+def _tell(facts: dict[str, object], written: Sequence[Receipt], as_json: bool) -> None:
+    """The report on the screen."""
+    if as_json:
+        typer.echo(json.dumps({**facts, "files": [receipt.document() for receipt in written]}, indent=2))
+        return
+    for name, value in facts.items():
+        typer.echo(f"{name:<18} {value}")
     for receipt in written:
         typer.echo(f"{receipt.path}  {receipt.size} bytes")
 

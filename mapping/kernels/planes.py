@@ -1,0 +1,964 @@
+"""Compiled loops of plane extraction (S12): cells, RANSAC and PCA in them, growing, labels, outlines.
+
+Points are sorted once along a Morton curve, so that a cell of any size is a run of neighbours: `key[k]` interleaves the
+bits of a point's indices on the finest lattice, and a cell of depth d owns the points whose keys agree above the lowest
+3 (deepest - d) bits. A cell's row holds what growing needs:
+
+    WEIGHT CX CY CZ XX XY XZ YY YZ ZZ   weighted moments of its inliers: sum, centre of gravity, scatter about it
+    NX NY NZ D                          its plane <n, p> = D
+    COUNT                               inliers
+    SIGMA                               range noise at its centre
+    DOUBT                               standard deviation of the normal's direction, rad
+
+Run the tests also with NUMBA_BOUNDSCHECK=1 (and a NUMBA_CACHE_DIR of its own) and with NUMBA_DISABLE_JIT=1.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+WEIGHT, CX, CY, CZ, XX, XY, XZ, YY, YZ, ZZ, NX, NY, NZ, D, COUNT, SIGMA, DOUBT = range(17)
+ROW = 17
+BITS = 20  # of an index on the finest lattice: 3 of them fit a key, with room for a mark
+
+# Columns of a rule vector, made by PlaneRules.vector().
+MIN_POINTS, ITERATIONS, INLIER_M, INLIER_SIGMAS, COSINE, APART_M, SHARE, REFINE, SEED = range(9)
+SIGMA_M, SIGMA_PER_M2, FLAT_M, WARP, STEP_PER_M2, CELL_M = range(9, 15)
+RULES = 15
+
+_MISS = 0.001  # chance of stopping before a plane that is there was hit
+_STEPS_A_CELL = 6.0
+_JOIN_SLOPES = 5.0  # parts of one plane differ in direction by at most so many times what it may warp
+_WAVE = 0.03  # a surface's scatter about its plane, against that along its shorter side: 0.03 is a kink of 7 degrees
+_WORST_DOUBT = 0.13  # rad: half of what normals of neighbours may differ by
+
+
+# ----------------------------------------------------------------------------------------------------- sorting in cells
+
+
+@njit(cache=True, nogil=True)
+def spread(v: int) -> Any:
+    """The bits of an index (0 <= v < 2^20), two zeros between."""
+    v = (v | (v << 32)) & 0x1F00000000FFFF
+    v = (v | (v << 16)) & 0x1F0000FF0000FF
+    v = (v | (v << 8)) & 0x100F00F00F00F00F
+    v = (v | (v << 4)) & 0x10C30C30C30C30C3
+    return (v | (v << 2)) & 0x1249249249249249
+
+
+@njit(cache=True, nogil=True)
+def squeeze(v: int) -> Any:
+    """The index that `spread` spread."""
+    v = v & 0x1249249249249249
+    v = (v | (v >> 2)) & 0x10C30C30C30C30C3
+    v = (v | (v >> 4)) & 0x100F00F00F00F00F
+    v = (v | (v >> 8)) & 0x1F0000FF0000FF
+    v = (v | (v >> 16)) & 0x1F00000000FFFF
+    return (v | (v >> 32)) & 0x1FFFFF
+
+
+@njit(cache=True, nogil=True)
+def morton_keys(points: Any, corner: Any, size_m: float, key: Any) -> None:
+    """Keys (N,) of points (N, 3) on a lattice of cells of size_m whose first corner is given."""
+    top = (1 << BITS) - 1
+    for k in range(points.shape[0]):
+        i = min(max(math.floor((points[k, 0] - corner[0]) / size_m), 0), top)
+        j = min(max(math.floor((points[k, 1] - corner[1]) / size_m), 0), top)
+        h = min(max(math.floor((points[k, 2] - corner[2]) / size_m), 0), top)
+        key[k] = spread(i) | (spread(j) << 1) | (spread(h) << 2)
+
+
+@njit(cache=True, nogil=True)
+def sort_by_key(key: Any) -> Any:
+    """(order, sorted keys): stable radix sort of keys >= 0, eleven bits a pass."""
+    n = key.size
+    order, other = np.arange(n), np.empty(n, np.int64)
+    now, after = key.copy(), np.empty(n, np.int64)
+    most = 0
+    for k in range(n):
+        most = max(most, key[k])
+    shift = 0
+    while (most >> shift) > 0:
+        start = np.zeros(2049, np.int64)
+        for k in range(n):
+            start[((now[k] >> shift) & 2047) + 1] += 1
+        for b in range(2048):
+            start[b + 1] += start[b]
+        for k in range(n):
+            b = (now[k] >> shift) & 2047
+            at = start[b]
+            start[b] = at + 1
+            after[at] = now[k]
+            other[at] = order[k]
+        now, after = after, now
+        order, other = other, order
+        shift += 11
+    return order, now
+
+
+@njit(cache=True, nogil=True)
+def usable(points: Any, farthest_m: float) -> Any:
+    """(N,) whether a point is finite and not beyond."""
+    n = points.shape[0]
+    good = np.empty(n, np.bool_)
+    limit = farthest_m * farthest_m
+    for k in range(n):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        good[k] = x * x + y * y + z * z <= limit  # NaN fails
+    return good
+
+
+@njit(cache=True, nogil=True)
+def gather(points: Any, order: Any, x: Any, y: Any, z: Any) -> None:
+    """Columns in sorted order."""
+    for k in range(order.size):
+        i = order[k]
+        x[k], y[k], z[k] = points[i, 0], points[i, 1], points[i, 2]
+
+
+@njit(cache=True, nogil=True)
+def weigh(x: Any, y: Any, z: Any, rules: Any, weight: Any) -> None:
+    """Weights 1/sigma^2 by range from the sensor, which is the origin."""
+    for k in range(x.size):
+        sigma = noise(x[k] * x[k] + y[k] * y[k] + z[k] * z[k], rules)
+        weight[k] = 1.0 / (sigma * sigma)
+
+
+@njit(cache=True, nogil=True)
+def noise(range2: float, rules: Any) -> Any:
+    """Standard deviation of a range, by its square."""
+    return rules[SIGMA_M] + rules[SIGMA_PER_M2] * range2
+
+
+@njit(cache=True, nogil=True)
+def runs_of(key: Any, shift: int) -> Any:
+    """(C + 1,) where runs of keys that agree above `shift` bits begin, and the end."""
+    n = key.size
+    count = 0
+    for k in range(n):
+        if k == 0 or (key[k] >> shift) != (key[k - 1] >> shift):
+            count += 1
+    start = np.empty(count + 1, np.int64)
+    count = 0
+    for k in range(n):
+        if k == 0 or (key[k] >> shift) != (key[k - 1] >> shift):
+            start[count] = k
+            count += 1
+    start[count] = n
+    return start
+
+
+@njit(cache=True, nogil=True)
+def run_end(key: Any, begin: int, end: int, shift: int) -> Any:
+    """Where the run of keys that agree with that of `begin` above `shift` bits ends, at most `end`."""
+    wanted = key[begin] >> shift
+    low, high = begin + 1, end
+    while low < high:
+        middle = (low + high) // 2
+        if (key[middle] >> shift) == wanted:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+# ----------------------------------------------------------------------------------------------------------- PCA
+
+
+@njit(cache=True, nogil=True)
+def add_scatter(a: Any, b: Any, out: Any) -> None:
+    """Moments (first ten columns) of two sets of points together; out may be a."""
+    wa, wb = a[WEIGHT], b[WEIGHT]
+    w = wa + wb
+    if w <= 0.0:
+        return
+    dx, dy, dz = b[CX] - a[CX], b[CY] - a[CY], b[CZ] - a[CZ]
+    f, g = wa * wb / w, wb / w
+    out[XX], out[XY], out[XZ] = a[XX] + b[XX] + f * dx * dx, a[XY] + b[XY] + f * dx * dy, a[XZ] + b[XZ] + f * dx * dz
+    out[YY], out[YZ], out[ZZ] = a[YY] + b[YY] + f * dy * dy, a[YZ] + b[YZ] + f * dy * dz, a[ZZ] + b[ZZ] + f * dz * dz
+    out[CX], out[CY], out[CZ] = a[CX] + g * dx, a[CY] + g * dy, a[CZ] + g * dz
+    out[WEIGHT] = w
+
+
+@njit(cache=True, nogil=True)
+def scatter_of(
+    x: Any, y: Any, z: Any, weight: Any, begin: int, end: int, nx: float, ny: float, nz: float, d: float,
+    limit: float, row: Any,
+) -> Any:  # fmt: skip
+    """Weighted moments of the points within limit of a plane, into row; returns how many. Centred: exact far away."""
+    x0, y0, z0 = x[begin], y[begin], z[begin]
+    n = 0
+    w = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+    for k in range(begin, end):
+        if abs(nx * x[k] + ny * y[k] + nz * z[k] - d) <= limit:
+            u, v, t, m = x[k] - x0, y[k] - y0, z[k] - z0, weight[k]
+            n += 1
+            w += m
+            sx += m * u
+            sy += m * v
+            sz += m * t
+            xx += m * u * u
+            xy += m * u * v
+            xz += m * u * t
+            yy += m * v * v
+            yz += m * v * t
+            zz += m * t * t
+    row[WEIGHT], row[COUNT] = w, n
+    if n > 0:
+        row[CX], row[CY], row[CZ] = x0 + sx / w, y0 + sy / w, z0 + sz / w
+        row[XX], row[XY], row[XZ] = xx - sx * sx / w, xy - sx * sy / w, xz - sx * sz / w
+        row[YY], row[YZ], row[ZZ] = yy - sy * sy / w, yz - sy * sz / w, zz - sz * sz / w
+    return n
+
+
+@njit(cache=True, nogil=True)
+def fit_plane(row: Any) -> Any:
+    """Plane of a row's moments (eq. 5.23) into the row: the eigenvector of the smallest eigenvalue, by Jacobi turns.
+
+    The normal's largest component is positive.  Returns the eigenvalues (smallest, middle, largest), never below 0.
+    """
+    a, b, c = row[XX], row[YY], row[ZZ]
+    p, q, r = row[XY], row[XZ], row[YZ]
+    v = np.eye(3)
+    for _ in range(12):
+        off = abs(p) + abs(q) + abs(r)
+        if off <= 1e-15 * (abs(a) + abs(b) + abs(c)):
+            break
+        if p != 0.0:  # turn x and y
+            t, cs, sn = _turn(a, b, p)
+            a, b, p, q, r = a - t * p, b + t * p, 0.0, cs * q - sn * r, sn * q + cs * r
+            _turn_columns(v, 0, 1, cs, sn)
+        if q != 0.0:  # x and z
+            t, cs, sn = _turn(a, c, q)
+            a, c, q, p, r = a - t * q, c + t * q, 0.0, cs * p - sn * r, sn * p + cs * r
+            _turn_columns(v, 0, 2, cs, sn)
+        if r != 0.0:  # y and z
+            t, cs, sn = _turn(b, c, r)
+            b, c, r, p, q = b - t * r, c + t * r, 0.0, cs * p - sn * q, sn * p + cs * q
+            _turn_columns(v, 1, 2, cs, sn)
+    least, at = a, 0
+    if b < least:
+        least, at = b, 1
+    if c < least:
+        least, at = c, 2
+    most = max(a, b, c)
+    middle = a + b + c - least - most
+    nx, ny, nz = v[0, at], v[1, at], v[2, at]
+    largest = nx
+    if abs(ny) > abs(largest):
+        largest = ny
+    if abs(nz) > abs(largest):
+        largest = nz
+    if largest < 0.0:
+        nx, ny, nz = -nx, -ny, -nz
+    row[NX], row[NY], row[NZ] = nx, ny, nz
+    row[D] = nx * row[CX] + ny * row[CY] + nz * row[CZ]
+    return max(least, 0.0), max(middle, 0.0), max(most, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _turn(a: float, b: float, p: float) -> Any:
+    """(tangent, cosine, sine) of the turn that makes the off-diagonal p of [[a, p], [p, b]] zero."""
+    theta = (b - a) / (2.0 * p)
+    t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
+    if theta < 0.0:
+        t = -t
+    c = 1.0 / math.sqrt(t * t + 1.0)
+    return t, c, t * c
+
+
+@njit(cache=True, nogil=True)
+def _turn_columns(v: Any, i: int, j: int, c: float, s: float) -> None:
+    for k in range(3):
+        f, g = v[k, i], v[k, j]
+        v[k, i], v[k, j] = c * f - s * g, s * f + c * g
+
+
+# ---------------------------------------------------------------------------------------------------------- RANSAC
+
+
+@njit(cache=True, nogil=True)
+def seeded(key: int, seed: int) -> Any:
+    """A generator's first state for a cell: by its place and the seed, whoever works on it and when."""
+    v = (key ^ (key >> 31) ^ seed) & 0x7FFFFFFF
+    return (v * 2654435761 + 12345) & 0xFFFFFFFF
+
+
+@njit(cache=True, nogil=True)
+def ransac(x: Any, y: Any, z: Any, begin: int, end: int, limit: float, iterations: int, state: int) -> Any:
+    """(inliers, nx, ny, nz, d) of the best of planes through three points each; 0 inliers if all were collinear.
+
+    Stops when a plane with more inliers than the best would have been hit with probability 1 - _MISS: the book's
+    iterations are the most that are tried.
+    """
+    n = end - begin
+    best, bx, by, bz, bd = 0, 0.0, 0.0, 0.0, 0.0
+    needed = iterations
+    done = 0
+    while done < needed:
+        done += 1
+        state = (state * 1664525 + 1013904223) & 0xFFFFFFFF
+        i = begin + (((state >> 8) * n) >> 24)
+        state = (state * 1664525 + 1013904223) & 0xFFFFFFFF
+        j = begin + (((state >> 8) * n) >> 24)
+        state = (state * 1664525 + 1013904223) & 0xFFFFFFFF
+        k = begin + (((state >> 8) * n) >> 24)
+        ax, ay, az = x[j] - x[i], y[j] - y[i], z[j] - z[i]
+        cx, cy, cz = x[k] - x[i], y[k] - y[i], z[k] - z[i]
+        nx, ny, nz = ay * cz - az * cy, az * cx - ax * cz, ax * cy - ay * cx
+        area2 = nx * nx + ny * ny + nz * nz
+        longest2 = max(ax * ax + ay * ay + az * az, cx * cx + cy * cy + cz * cz)
+        if area2 <= 1e-4 * longest2 * longest2 or area2 < 1e-200:  # equal or collinear
+            continue
+        f = 1.0 / math.sqrt(area2)
+        nx, ny, nz = nx * f, ny * f, nz * f
+        d = nx * x[i] + ny * y[i] + nz * z[i]
+        count = inliers_of(x, y, z, begin, end, nx, ny, nz, d, limit)
+        if count > best:
+            best, bx, by, bz, bd = count, nx, ny, nz, d
+            share = count / n
+            hit = share * share * share
+            if hit >= 1.0:
+                break
+            needed = min(needed, done + int(math.log(_MISS) / math.log(1.0 - hit)))
+    return best, bx, by, bz, bd
+
+
+@njit(cache=True, nogil=True)
+def inliers_of(
+    x: Any, y: Any, z: Any, begin: int, end: int, nx: float, ny: float, nz: float, d: float, limit: float
+) -> Any:
+    """How many points are within limit of a plane. A loop without branches, which the compiler makes wide."""
+    count = 0
+    for k in range(begin, end):
+        count += abs(nx * x[k] + ny * y[k] + nz * z[k] - d) <= limit
+    return count
+
+
+@njit(cache=True, nogil=True)
+def fit_cell(x: Any, y: Any, z: Any, weight: Any, begin: int, end: int, state: int, rules: Any, row: Any) -> Any:
+    """The plane of one cell into row (step 3: RANSAC, then PCA on its inliers); returns the share of inliers, 0 if
+    there is no plane: too few inliers, or its direction is in doubt."""
+    n = end - begin
+    limit = rules[INLIER_M]
+    least = rules[MIN_POINTS]
+    if rules[REFINE] > 0.0:
+        middle = (begin + end) // 2
+        sigma = noise(x[middle] * x[middle] + y[middle] * y[middle] + z[middle] * z[middle], rules)
+        limit = min(limit, rules[INLIER_SIGMAS] * sigma + rules[FLAT_M])
+        scatter_of(x, y, z, weight, begin, end, 0.0, 0.0, 0.0, 0.0, 1.0, row)  # most cells hold one plane: try it
+        fit_plane(row)
+        count = inliers_of(x, y, z, begin, end, row[NX], row[NY], row[NZ], row[D], limit)
+        if count < 0.95 * n:
+            count, nx, ny, nz, d = ransac(x, y, z, begin, end, limit, int(rules[ITERATIONS]), state)
+            row[NX], row[NY], row[NZ], row[D] = nx, ny, nz, d
+    else:
+        count, nx, ny, nz, d = ransac(x, y, z, begin, end, limit, int(rules[ITERATIONS]), state)
+        row[NX], row[NY], row[NZ], row[D] = nx, ny, nz, d
+    if count < least or count < 3:
+        row[COUNT] = 0.0
+        return 0.0
+    count = scatter_of(x, y, z, weight, begin, end, row[NX], row[NY], row[NZ], row[D], limit, row)
+    small, middle_value, _ = fit_plane(row)
+    range2 = row[CX] * row[CX] + row[CY] * row[CY] + row[CZ] * row[CZ]
+    row[SIGMA] = noise(range2, rules)
+    variance = max(small, row[WEIGHT] * row[SIGMA] ** 2 if rules[REFINE] > 0.0 else 0.0)
+    row[DOUBT] = math.sqrt(variance / (count * middle_value)) if middle_value > 0.0 else math.inf
+    if middle_value <= 0.0 or (rules[REFINE] > 0.0 and row[DOUBT] > _WORST_DOUBT):
+        row[COUNT] = 0.0
+        return 0.0
+    return count / n
+
+
+@njit(cache=True, nogil=True)
+def fit_cells(
+    x: Any, y: Any, z: Any, weight: Any, key: Any, start: Any, first: int, last: int, depth: int, book_depth: int,
+    deepest: int, rules: Any, row: Any, begin: Any, end: Any, level: Any,
+) -> Any:  # fmt: skip
+    """Planes of the cells under runs first to last - 1 of `start`, which are those of `depth`; returns how many cells.
+
+    A cell that is larger than the book's (depth < book_depth) is cut into eight while that leaves each part points
+    enough; one of the book's size or less while one plane does not explain it (rules SHARE). Cells come in the order
+    of their points and cover all of them; those without a plane have COUNT 0.
+    """
+    cells = 0
+    least = rules[MIN_POINTS]
+    room = 8 * (BITS + 2)
+    stack_begin, stack_end, stack_level = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64)
+    for run in range(first, last):
+        stack_begin[0], stack_end[0], stack_level[0] = start[run], start[run + 1], depth
+        top = 1
+        while top > 0:
+            top -= 1
+            b, e, here = stack_begin[top], stack_end[top], stack_level[top]
+            n = e - b
+            cut = here < book_depth and n >= 8.0 * least
+            row[cells, COUNT] = 0.0
+            if not cut and n >= least:
+                state = seeded(key[b] >> (3 * (deepest - here)), int(rules[SEED]))
+                share = fit_cell(x, y, z, weight, b, e, state, rules, row[cells])
+                cut = share < rules[SHARE] and here < deepest and n >= 2.0 * least
+                if cut and rules[STEP_PER_M2] > 0.0:  # a part as small as a step of depth would look across the steps
+                    size = rules[CELL_M] * 2.0 ** (book_depth - here - 1)
+                    range2 = x[b] * x[b] + y[b] * y[b] + z[b] * z[b]
+                    cut = size >= _STEPS_A_CELL * rules[STEP_PER_M2] * range2
+            if not cut:
+                begin[cells], end[cells], level[cells] = b, e, here
+                cells += 1
+                continue
+            shift = 3 * (deepest - here - 1)
+            at, parts = b, 0
+            while at < e:  # the last part goes to the bottom of the stack's new part, so that they come out in order
+                stop = run_end(key, at, e, shift)
+                stack_begin[top + parts], stack_end[top + parts], stack_level[top + parts] = at, stop, here + 1
+                parts += 1
+                at = stop
+            for k in range(parts // 2):
+                i, j = top + k, top + parts - 1 - k
+                stack_begin[i], stack_begin[j] = stack_begin[j], stack_begin[i]
+                stack_end[i], stack_end[j] = stack_end[j], stack_end[i]
+            top += parts
+    return cells
+
+
+@njit(cache=True, nogil=True)
+def local_noise(
+    x: Any, y: Any, z: Any, key: Any, deepest: int, smallest: int, most: int, least: int, samples: int, range_m: Any,
+    sigma: Any,
+) -> Any:  # fmt: skip
+    """Scatter of points about the planes of small cells, and the cells' range; returns how many were looked at.
+
+    Small: the first on the way down that holds at most `most` points, or is of depth `smallest`; those with less than
+    `least` say nothing.  sigma is corrected for the three numbers that a plane takes.
+    """
+    n = key.size
+    stride = max(1, n // max(samples, 1))
+    row = np.zeros(ROW)
+    ones = np.ones(n)
+    found, at = 0, 0
+    while at < n and found < range_m.size:
+        depth, begin = 0, first_of_run(key, at, 0, 3 * deepest)
+        stop = run_end(key, at, n, 3 * deepest)
+        while stop - begin > most and depth < smallest:
+            depth += 1
+            shift = 3 * (deepest - depth)
+            begin = first_of_run(key, at, begin, shift)
+            stop = run_end(key, at, stop, shift)
+        if stop - begin >= least:
+            count = scatter_of(x, y, z, ones, begin, stop, 0.0, 0.0, 0.0, 0.0, 1.0, row)
+            small, middle, _ = fit_plane(row)
+            if middle > 4.0 * small:
+                range_m[found] = math.sqrt(row[CX] ** 2 + row[CY] ** 2 + row[CZ] ** 2)
+                sigma[found] = math.sqrt(small / (count - 3.0))
+                found += 1
+        at = max(stop, at + stride)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def first_of_run(key: Any, at: int, low: int, shift: int) -> Any:
+    """The first index from low on whose key agrees with that of `at` above `shift` bits."""
+    wanted = key[at] >> shift
+    high = at
+    while low < high:
+        middle = (low + high) // 2
+        if (key[middle] >> shift) == wanted:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+# ---------------------------------------------------------------------------------------------------------- neighbours
+
+
+@njit(cache=True, nogil=True)
+def neighbours_of_cells(key: Any, begin: Any, level: Any, cells: int, deepest: int, shallowest: int) -> Any:
+    """(first, neighbour): cells that touch cell c, corners included, are neighbour[first[c]: first[c + 1]].
+
+    A neighbour is as large, or larger (found here), or smaller (found from there).
+    """
+    size = 16
+    while size < 3 * cells:
+        size *= 2
+    mark, index = np.full(size, -1, np.int64), np.empty(size, np.int64)
+    for c in range(cells):
+        put(mark, index, tagged(key[begin[c]], level[c], deepest), c)
+    pair = np.empty((26 * cells, 2), np.int64)
+    pairs = 0
+    for c in range(cells):
+        own = key[begin[c]] >> (3 * (deepest - level[c]))
+        i, j, h = squeeze(own), squeeze(own >> 1), squeeze(own >> 2)
+        top = 1 << (BITS - (deepest - level[c]))
+        before = pairs
+        for step in range(27):
+            if step == 13:
+                continue
+            a, b, d = i + step // 9 - 1, j + step // 3 % 3 - 1, h + step % 3 - 1
+            if a < 0 or b < 0 or d < 0 or a >= top or b >= top or d >= top:
+                continue
+            there = spread(a) | (spread(b) << 1) | (spread(d) << 2)
+            depth = level[c]
+            while depth >= shallowest:
+                other = get(mark, index, (1 << (3 * (BITS - deepest + depth))) | there)
+                if other >= 0:
+                    if depth < level[c] or other > c:
+                        new = other != c
+                        for k in range(before, pairs):
+                            if pair[k, 1] == other:
+                                new = False
+                                break
+                        if new:
+                            pair[pairs, 0], pair[pairs, 1] = c, other
+                            pairs += 1
+                    break
+                there >>= 3
+                depth -= 1
+    first = np.zeros(cells + 1, np.int64)
+    for k in range(pairs):
+        first[pair[k, 0] + 1] += 1
+        first[pair[k, 1] + 1] += 1
+    for c in range(cells):
+        first[c + 1] += first[c]
+    fill, neighbour = first[:-1].copy(), np.empty(2 * pairs, np.int64)
+    for k in range(pairs):
+        a, b = pair[k, 0], pair[k, 1]
+        neighbour[fill[a]] = b
+        neighbour[fill[b]] = a
+        fill[a] += 1
+        fill[b] += 1
+    return first, neighbour
+
+
+@njit(cache=True, nogil=True)
+def tagged(key: int, depth: int, deepest: int) -> Any:
+    """A cell's name: its key at its depth under a mark bit, so that no two depths share one."""
+    up = deepest - depth
+    return (1 << (3 * (BITS - up))) | (key >> (3 * up))
+
+
+@njit(cache=True, nogil=True)
+def slot_of(name: int, size: int) -> Any:
+    """Where to look for a name first; size is a power of two."""
+    v = name ^ (name >> 33)
+    v = (v & 0x3FFFFFFF) * 2654435761 + (v >> 30)
+    return (v ^ (v >> 15)) & (size - 1)
+
+
+@njit(cache=True, nogil=True)
+def put(mark: Any, index: Any, name: int, value: int) -> None:
+    """Into an open-addressed table that has room."""
+    at = slot_of(name, mark.size)
+    while mark[at] >= 0:
+        at = (at + 1) & (mark.size - 1)
+    mark[at], index[at] = name, value
+
+
+@njit(cache=True, nogil=True)
+def get(mark: Any, index: Any, name: int) -> Any:
+    """The value of a name, -1 if it is not there."""
+    at = slot_of(name, mark.size)
+    while mark[at] >= 0:
+        if mark[at] == name:
+            return index[at]
+        at = (at + 1) & (mark.size - 1)
+    return -1
+
+
+# ------------------------------------------------------------------------------------------------------ region growing
+
+
+@njit(cache=True, nogil=True)
+def grow(row: Any, seeds: Any, first: Any, neighbour: Any, wide: bool, rules: Any, region: Any, sums: Any) -> Any:
+    """Step 4: regions of cells whose planes continue each other; region (C,) becomes each cell's, -1 without a plane.
+
+    A neighbour joins if its normal is within the angle and its centre of gravity within the distance of the plane of
+    the cell that it touches. Refined, it is also held against the plane of the whole region so far, with a distance
+    by the noise: a region cannot bend away. wide: only against that, with the book's distance.
+    sums (C, ROW): the first of them become the regions' moments and planes. Returns how many.
+    """
+    cells = region.size
+    queue = np.empty(cells, np.int64)
+    for c in range(cells):
+        region[c] = -1
+    regions = 0
+    by_neighbour, by_region = not wide, not wide and rules[REFINE] > 0.0
+    for seed in seeds:
+        if region[seed] >= 0 or row[seed, COUNT] <= 0.0:
+            continue
+        whole = sums[regions]
+        whole[:] = row[seed]
+        region[seed] = regions
+        queue[0] = seed
+        head, tail, fitted = 0, 1, 1
+        while head < tail:
+            c = queue[head]
+            head += 1
+            for k in range(first[c], first[c + 1]):
+                other = neighbour[k]
+                if region[other] >= 0 or row[other, COUNT] <= 0.0:
+                    continue
+                if by_neighbour and not continues(row[c], row[other], rules, rules[APART_M]):
+                    continue
+                if by_region and not continues(whole, row[other], rules, allowed(whole, row[other], rules)):
+                    continue
+                if wide and not continues(whole, row[other], rules, rules[APART_M]):
+                    continue
+                region[other] = regions
+                queue[tail] = other
+                tail += 1
+                add_scatter(whole, row[other], whole)
+                whole[COUNT] += row[other, COUNT]
+                if tail <= 8 or tail >= fitted + fitted // 4:
+                    fit_plane(whole)
+                    fitted = tail
+        fit_plane(whole)
+        regions += 1
+    return regions
+
+
+@njit(cache=True, nogil=True)
+def continues(a: Any, b: Any, rules: Any, apart_m: float) -> Any:
+    """Whether plane b goes on where plane a is: normals within the angle, b's centre within apart_m of a."""
+    along = a[NX] * b[NX] + a[NY] * b[NY] + a[NZ] * b[NZ]
+    if abs(along) < rules[COSINE]:
+        return False
+    return abs(a[NX] * b[CX] + a[NY] * b[CY] + a[NZ] * b[CZ] - a[D]) <= apart_m
+
+
+@njit(cache=True, nogil=True)
+def allowed(a: Any, b: Any, rules: Any) -> Any:
+    """How far b's centre may be off the plane of a: by noise, by what planes are not flat, more the farther away."""
+    dx, dy, dz = b[CX] - a[CX], b[CY] - a[CY], b[CZ] - a[CZ]
+    noise_m = rules[INLIER_SIGMAS] * max(a[SIGMA], b[SIGMA]) + rules[FLAT_M]
+    return min(noise_m + rules[WARP] * math.sqrt(dx * dx + dy * dy + dz * dz), max(noise_m, rules[APART_M]))
+
+
+@njit(cache=True, nogil=True)
+def join_regions(region: Any, first: Any, neighbour: Any, sums: Any, regions: int, rules: Any) -> Any:
+    """Regions that touch become one where they are one plane (`one_plane`), in the order of their cells.
+
+    sums become theirs; region is renumbered. Returns how many are left.
+    """
+    parent = np.arange(regions)
+    both = np.zeros(ROW)
+    for c in range(region.size):
+        if region[c] < 0:
+            continue
+        for k in range(first[c], first[c + 1]):
+            other = neighbour[k]
+            if other < c or region[other] < 0:
+                continue
+            a, b = root_of(parent, region[c]), root_of(parent, region[other])
+            if a == b or not one_plane(sums[a], sums[b], rules, both):
+                continue
+            keep, gone = min(a, b), max(a, b)
+            parent[gone] = keep
+            both[COUNT] = sums[a, COUNT] + sums[b, COUNT]
+            both[SIGMA] = sums[keep, SIGMA]
+            sums[keep] = both
+    number = np.full(regions, -1, np.int64)
+    left = 0
+    for r in range(regions):
+        if parent[r] == r:
+            number[r] = left
+            sums[left] = sums[r]
+            left += 1
+    for c in range(region.size):
+        if region[c] >= 0:
+            region[c] = number[root_of(parent, region[c])]
+    return left
+
+
+@njit(cache=True, nogil=True)
+def gather_flat(region: Any, regions: int, row: Any, wide: Any, wide_sums: Any, rules: Any, sums: Any) -> Any:
+    """Regions most of whose cells lie in one of the wide regions (C,) become one, if that is flat as a whole: seen
+    against its size it scatters as little as _WAVE. A floor that sags stays one plane, a vault does not. region and
+    sums change; returns how many are left."""
+    wides = wide_sums.shape[0]
+    flat = np.zeros(wides, np.bool_)
+    for r in range(wides):
+        small, middle, _ = fit_plane(wide_sums[r])
+        most = wide_sums[r, WEIGHT] * (0.5 * rules[INLIER_M]) ** 2
+        flat[r] = small <= _WAVE * _WAVE * middle and small <= most
+    cells, within = np.zeros(regions, np.int64), np.zeros(regions, np.int64)
+    home = np.full(regions, -1, np.int64)
+    for turn in range(2):  # a vote for the wide region of most cells (Boyer and Moore), then its count
+        for c in range(region.size):
+            r = region[c]
+            if r < 0:
+                continue
+            if turn == 0:
+                if cells[r] == 0:
+                    home[r] = wide[c]
+                cells[r] += 1 if home[r] == wide[c] else -1
+            else:
+                within[r] += 1 if home[r] == wide[c] else -1
+    number, of_wide = np.full(regions, -1, np.int64), np.full(wides, -1, np.int64)
+    left = 0
+    for r in range(regions):
+        h = home[r]
+        if h >= 0 and within[r] > 0 and flat[h]:
+            if of_wide[h] < 0:
+                of_wide[h] = left
+                left += 1
+            number[r] = of_wide[h]
+        else:
+            number[r] = left
+            left += 1
+    sums[:] = 0.0
+    for c in range(region.size):
+        if region[c] >= 0:
+            r = number[region[c]]
+            region[c] = r
+            if sums[r, WEIGHT] == 0.0:
+                sums[r] = row[c]
+            else:
+                add_scatter(sums[r], row[c], sums[r])
+                sums[r, COUNT] += row[c, COUNT]
+    for r in range(left):
+        fit_plane(sums[r])
+    return left
+
+
+@njit(cache=True, nogil=True)
+def root_of(parent: Any, r: int) -> Any:
+    """The region that r was joined to in the end."""
+    while parent[r] != r:
+        parent[r] = parent[parent[r]]
+        r = parent[r]
+    return r
+
+
+@njit(cache=True, nogil=True)
+def one_plane(a: Any, b: Any, rules: Any, both: Any) -> Any:
+    """Whether parts continue each other: each one's centre is near the other's plane, and all points together scatter
+    hardly more than apart. both becomes their moments and plane."""
+    limit = allowed(a, b, rules)
+    if not (continues(a, b, rules, limit) and continues(b, a, rules, limit)):
+        return False
+    if abs(a[NX] * b[NX] + a[NY] * b[NY] + a[NZ] * b[NZ]) < math.cos(_JOIN_SLOPES * rules[WARP]):
+        return False
+    add_scatter(a, b, both)
+    small, _, _ = fit_plane(both)
+    apart = square_sum(a) + square_sum(b)
+    return small <= 1.3 * apart + both[WEIGHT] * (0.5 * limit) ** 2
+
+
+@njit(cache=True, nogil=True)
+def square_sum(a: Any) -> Any:
+    """Weighted sum of squared distances of a row's points from its plane: n' S n."""
+    x, y, z = a[NX], a[NY], a[NZ]
+    twice = x * y * a[XY] + x * z * a[XZ] + y * z * a[YZ]
+    return max(0.0, x * x * a[XX] + y * y * a[YY] + z * z * a[ZZ] + 2.0 * twice)
+
+
+# ------------------------------------------------------------------------------------------------------------- labels
+
+
+@njit(cache=True, nogil=True)
+def label_inliers(
+    x: Any, y: Any, z: Any, begin: Any, end: Any, row: Any, region: Any, limit: float, label: Any
+) -> None:
+    """The book's labels: a cell's inliers belong to its region; all else is -1."""
+    for c in range(region.size):
+        for k in range(begin[c], end[c]):
+            off = abs(row[c, NX] * x[k] + row[c, NY] * y[k] + row[c, NZ] * z[k] - row[c, D])
+            label[k] = region[c] if region[c] >= 0 and off <= limit else -1
+
+
+@njit(cache=True, nogil=True)
+def label_nearest(
+    x: Any, y: Any, z: Any, begin: Any, end: Any, region: Any, first: Any, neighbour: Any, plane: Any, rms: Any,
+    rules: Any, from_cell: int, to_cell: int, label: Any,
+) -> None:  # fmt: skip
+    """Labels of the points of cells from_cell to to_cell - 1: of the planes of its cell and of those that touch it,
+    the one that is fewest tolerances away, if that is less than one; else -1.
+
+    plane: (R, 4) n and d; rms: (R,), a tolerance grows with what a plane's own points scatter.
+    """
+    near = np.empty(64, np.int64)
+    for c in range(from_cell, to_cell):
+        count = 0
+        if region[c] >= 0:
+            near[0] = region[c]
+            count = 1
+        for k in range(first[c], first[c + 1]):
+            r = region[neighbour[k]]
+            if r < 0 or count == near.size:
+                continue
+            new = True
+            for i in range(count):
+                if near[i] == r:
+                    new = False
+                    break
+            if new:
+                near[count] = r
+                count += 1
+        for k in range(begin[c], end[c]):
+            best, at = 1.0, -1
+            sigma = noise(x[k] * x[k] + y[k] * y[k] + z[k] * z[k], rules)
+            for i in range(count):
+                r = near[i]
+                off = abs(plane[r, 0] * x[k] + plane[r, 1] * y[k] + plane[r, 2] * z[k] - plane[r, 3])
+                off /= rules[INLIER_SIGMAS] * max(sigma, rms[r]) + rules[FLAT_M]
+                if off < best:
+                    best, at = off, r
+            label[k] = at
+
+
+@njit(cache=True, nogil=True)
+def sums_of_labels(x: Any, y: Any, z: Any, weight: Any, label: Any, centre: Any, sums: Any) -> None:
+    """Weighted moments (R, ROW) of the points of each label, about centres (R, 3) near them; COUNT, too."""
+    sums[:] = 0.0
+    for k in range(label.size):
+        r = label[k]
+        if r < 0:
+            continue
+        u, v, t, m = x[k] - centre[r, 0], y[k] - centre[r, 1], z[k] - centre[r, 2], weight[k]
+        s = sums[r]
+        s[COUNT] += 1.0
+        s[WEIGHT] += m
+        s[CX] += m * u
+        s[CY] += m * v
+        s[CZ] += m * t
+        s[XX] += m * u * u
+        s[XY] += m * u * v
+        s[XZ] += m * u * t
+        s[YY] += m * v * v
+        s[YZ] += m * v * t
+        s[ZZ] += m * t * t
+    for r in range(sums.shape[0]):
+        s = sums[r]
+        w = s[WEIGHT]
+        if w <= 0.0:
+            continue
+        a, b, c = s[CX] / w, s[CY] / w, s[CZ] / w
+        s[XX] -= w * a * a
+        s[XY] -= w * a * b
+        s[XZ] -= w * a * c
+        s[YY] -= w * b * b
+        s[YZ] -= w * b * c
+        s[ZZ] -= w * c * c
+        s[CX], s[CY], s[CZ] = centre[r, 0] + a, centre[r, 1] + b, centre[r, 2] + c
+        fit_plane(s)
+
+
+# ------------------------------------------------------------------------------------------------------------ outlines
+
+
+@njit(cache=True, nogil=True)
+def groups_of(label: Any, regions: int) -> Any:
+    """(first, member): points of label r are member[first[r]: first[r + 1]], in their order."""
+    first = np.zeros(regions + 1, np.int64)
+    for k in range(label.size):
+        if label[k] >= 0:
+            first[label[k] + 1] += 1
+    for r in range(regions):
+        first[r + 1] += first[r]
+    fill, member = first[:-1].copy(), np.empty(first[regions], np.int64)
+    for k in range(label.size):
+        r = label[k]
+        if r >= 0:
+            member[fill[r]] = k
+            fill[r] += 1
+    return first, member
+
+
+@njit(cache=True, nogil=True)
+def hulls(x: Any, y: Any, z: Any, first: Any, member: Any, centre: Any, along: Any, across: Any, corner: Any) -> Any:
+    """Convex hulls of groups of points in their planes: (K + 1,) where each begins in corner (N, 2), counter-clockwise
+    as the axes along, across (R, 3) from centre (R, 3) span the plane.
+
+    Points inside the octagon of the extremes in eight directions are left out first; n log n in the rest.
+    """
+    regions = first.size - 1
+    begins = np.zeros(regions + 1, np.int64)
+    made = 0
+    for r in range(regions):
+        n = first[r + 1] - first[r]
+        u, v = np.empty(n), np.empty(n)
+        for k in range(n):
+            i = member[first[r] + k]
+            a, b, c = x[i] - centre[r, 0], y[i] - centre[r, 1], z[i] - centre[r, 2]
+            u[k] = a * along[r, 0] + b * along[r, 1] + c * along[r, 2]
+            v[k] = a * across[r, 0] + b * across[r, 1] + c * across[r, 2]
+        kept = outside_octagon(u, v)
+        made = chain(u[kept], v[kept], corner, made)
+        begins[r + 1] = made
+    return begins
+
+
+@njit(cache=True, nogil=True)
+def outside_octagon(u: Any, v: Any) -> Any:
+    """Indices of points that are not strictly inside the octagon of their extremes: all corners of the hull are."""
+    n = u.size
+    extreme = np.zeros(8, np.int64)
+    for k in range(n):
+        if u[k] < u[extreme[0]]:
+            extreme[0] = k
+        if u[k] + v[k] < u[extreme[1]] + v[extreme[1]]:
+            extreme[1] = k
+        if v[k] < v[extreme[2]]:
+            extreme[2] = k
+        if v[k] - u[k] < v[extreme[3]] - u[extreme[3]]:
+            extreme[3] = k
+        if u[k] > u[extreme[4]]:
+            extreme[4] = k
+        if u[k] + v[k] > u[extreme[5]] + v[extreme[5]]:
+            extreme[5] = k
+        if v[k] > v[extreme[6]]:
+            extreme[6] = k
+        if v[k] - u[k] > v[extreme[7]] - u[extreme[7]]:
+            extreme[7] = k
+    kept = np.empty(n, np.int64)
+    count = 0
+    for k in range(n):
+        inside = True
+        for s in range(8):
+            i, j = extreme[s], extreme[(s + 1) % 8]
+            if i == j:
+                continue
+            if (u[j] - u[i]) * (v[k] - v[i]) - (v[j] - v[i]) * (u[k] - u[i]) <= 0.0:
+                inside = False
+                break
+        if not inside:
+            kept[count] = k
+            count += 1
+    return kept[:count]
+
+
+@njit(cache=True, nogil=True)
+def chain(u: Any, v: Any, corner: Any, made: int) -> Any:
+    """Convex hull by two monotone chains, appended to corner from `made` on; returns the new end."""
+    n = u.size
+    by_u = np.argsort(u, kind="mergesort")
+    k = 0
+    while k < n:  # equal u: by v
+        j = k + 1
+        while j < n and u[by_u[j]] == u[by_u[k]]:
+            j += 1
+        if j - k > 1:
+            part = by_u[k:j].copy()
+            by_u[k:j] = part[np.argsort(v[part], kind="mergesort")]
+        k = j
+    start = made
+    for turn in range(2):
+        base = made
+        for step in range(n):
+            i = by_u[step] if turn == 0 else by_u[n - 1 - step]
+            while (
+                made - base >= 2
+                and (corner[made - 1, 0] - corner[made - 2, 0]) * (v[i] - corner[made - 2, 1])
+                - (corner[made - 1, 1] - corner[made - 2, 1]) * (u[i] - corner[made - 2, 0])
+                <= 0.0
+            ):
+                made -= 1
+            corner[made, 0], corner[made, 1] = u[i], v[i]
+            made += 1
+        made -= 1  # the last is the first of the other chain
+    return max(made, start + 1) if n else start
