@@ -1,0 +1,306 @@
+"""Rooms and doors of a grid, by its Voronoi diagram (S44; [Thr98]).
+
+Free space is cut where clearance has a minimum along the diagram (critical points), along the line to the base points
+on both sides (critical lines). That alone cuts far too often, at every cupboard: pieces are joined again, the least
+convincing cut first, until what is left looks like doors. See docs/algorithms/rooms.md.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mapping.grids.clearance import DistanceField
+from mapping.grids.geometry import check_resolution
+from mapping.kernels import rooms as kernels
+
+Bools = NDArray[np.bool_]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True)
+class RoomRules:
+    """When two pieces of free space are one room. One set for all maps.
+
+    clutter_m: obstacles that stand alone and are no longer or wider are furniture and belong to the room around them.
+    room_min_m2: smaller pieces join the neighbour they are most open to; alone they are no room.
+    keep, slack_m: a narrowing to no less than keep of the clearance beyond it, less slack_m, is no cut at all.
+
+    The other cuts are judged by a sum. It rises with the clearance in the passage, as a share of the mean clearance of
+    the piece where that is less (narrow_weight) and more (wide_weight), and with the share of the smaller piece's
+    outline that is open (open_weight). It falls with the clearance in metres (large_weight), and with the sharpness
+    of the corners on both sides, of the blunter (jamb_weight) and the sharper one (edge_weight). Above join it is no
+    door.
+    """
+
+    clutter_m: float = 1.0
+    room_min_m2: float = 2.5
+    keep: float = 0.95
+    slack_m: float = 0.0125
+    narrow_weight: float = 0.4
+    wide_weight: float = 0.75
+    open_weight: float = 1.1
+    large_weight: float = 1.0
+    jamb_weight: float = 0.5
+    edge_weight: float = 0.3
+    join: float = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Door:
+    """A passage between rooms a < b (numbers in RoomMap.rooms).
+
+    centre: cell [row, col] of the critical point.  ends: (2, 2) cells of its base points.  width_m: between them.
+    """
+
+    a: int
+    b: int
+    centre: tuple[int, int]
+    ends: tuple[tuple[int, int], tuple[int, int]]
+    width_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """number: from 1, as in the labels.  anchor: its cell [row, col] farthest from any obstacle, clearance_m that far.
+
+    area_m2 counts furniture that stands alone in it.
+    """
+
+    number: int
+    anchor: tuple[int, int]
+    clearance_m: float
+    area_m2: float
+
+
+@dataclass(frozen=True, slots=True)
+class RoomMap:
+    """labels: (R, C) int32, number of the room or 0.  rooms: numbers 1 to N in order.  doors: by rooms and place."""
+
+    resolution_m: float
+    labels: I32
+    rooms: tuple[Room, ...]
+    doors: tuple[Door, ...]
+
+
+def find_rooms(free: ArrayLike, resolution_m: float, rules: RoomRules | None = None) -> RoomMap:
+    """Rooms and doors of a grid.
+
+    free: (R, C), True where it was seen empty; all else, and what lies beyond the border, is an obstacle.
+    Time: some 60 ns a cell. The same cells give the same rooms in the same order.
+    Raises ValueError if free is not (R, C), has a side above 19,998, or resolution_m is no positive length.
+    """
+    rules, d = rules or RoomRules(), check_resolution(resolution_m)
+    given = np.asarray(free, dtype=np.bool_)
+    if given.ndim != 2 or given.size == 0:
+        raise ValueError(f"free cells are (R, C), got {given.shape}")
+    open_space = without_clutter(np.pad(given, 1), round(rules.clutter_m / d))
+    field = DistanceField(~open_space)
+    basin = np.empty(open_space.shape, dtype=np.int32)
+    order = kernels.widest_first(field.squared)
+    count = kernels.flood(field.squared, order, rules.keep, rules.slack_m / d, basin)
+    pieces = _Pieces(field, basin, count, d)
+    pieces.join_small(rules.room_min_m2 / (d * d))
+    pieces.join_unconvincing(rules)
+    labels = _number_rooms(basin, pieces, rules.room_min_m2 / (d * d))
+    rooms = _describe(labels, field.squared, order, d)
+    doors = find_doors(labels, field, d)
+    return RoomMap(d, np.ascontiguousarray(labels[1:-1, 1:-1]), rooms, doors)
+
+
+def without_clutter(free: Bools, side_cells: int) -> Bools:
+    """free (R, C) plus all obstacles, diagonally connected, that fit into a square of that many cells and do not touch
+    the border."""
+    label = np.empty(free.shape, dtype=np.int32)
+    count = int(kernels.connected(~free, True, label))
+    if count == 0:
+        return free
+    box = np.empty((count, 4), dtype=np.int32)
+    kernels.boxes(label, box)
+    inside = (box[:, :2] > 0).all(axis=1) & (box[:, 2:] < np.array(free.shape) - 1).all(axis=1)
+    small = inside & (np.maximum(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1]) < side_cells)
+    return np.asarray(free | np.append(small, False)[label])
+
+
+@dataclass(slots=True)
+class _Cut:
+    """Between two pieces: clearance of the widest passage in cells, cells side by side, sharpness of its corners."""
+
+    clearance: float
+    length: float
+    blunt: float
+    sharp: float
+
+    def join(self, other: _Cut) -> None:
+        """Both lead to the same piece now; the wider says what the passage looks like."""
+        self.length += other.length
+        if other.clearance > self.clearance:
+            self.clearance, self.blunt, self.sharp = other.clearance, other.blunt, other.sharp
+
+
+class _Pieces:
+    """Pieces of free space and the cuts between them, joined one by one. Deterministic: ties go to smaller numbers."""
+
+    def __init__(self, field: DistanceField, basin: I32, count: int, resolution_m: float) -> None:
+        self.area, self.clearance, self.outline = (np.zeros(count) for _ in range(3))
+        kernels.measure_basins(basin, field.squared, self.area, self.clearance, self.outline)
+        self.into = list(range(count))
+        self.cuts: list[dict[int, _Cut]] = [{} for _ in range(count)]
+        self._cell_m = resolution_m
+        found = _contacts(basin, field.squared)
+        points, lengths = _widest_contacts(found, count)
+        ruled = np.zeros(basin.shape, dtype=np.int32)
+        kernels.count_ruled(field.site, field.squared, ruled)
+        ends = np.empty((len(points), 4), dtype=np.int32)
+        sharpness = np.empty((len(points), 2))
+        kernels.jambs(field.site, field.squared, ruled, points[:, kernels.ROW :], ends, sharpness)
+        for (a, b, squared, _, _), length, (blunt, sharp) in zip(points.tolist(), lengths, sharpness.tolist()):
+            cut = _Cut(math.sqrt(squared), float(length), blunt, sharp)
+            self.cuts[a][b] = cut
+            self.cuts[b][a] = cut
+
+    def piece_of(self, k: int) -> int:
+        """The piece that took k in."""
+        while self.into[k] != k:
+            k = self.into[k]
+        return k
+
+    def join_small(self, cells: float) -> None:
+        """Give each piece with fewer cells to the neighbour it is most open to, the smallest first."""
+        waiting = [(self.area[k], k) for k in range(len(self.into)) if self.area[k] < cells]
+        heapq.heapify(waiting)
+        while waiting:
+            area, k = heapq.heappop(waiting)
+            if self.into[k] != k or area != self.area[k] or not self.cuts[k]:
+                continue
+            widest = max(self.cuts[k].items(), key=lambda item: (item[1].clearance, item[1].length, -item[0]))[0]
+            kept = self._join(k, widest)
+            if self.area[kept] < cells:
+                heapq.heappush(waiting, (self.area[kept], kept))
+
+    def join_unconvincing(self, rules: RoomRules) -> None:
+        """Join pieces while the least convincing cut is no door."""
+        version = [0] * len(self.into)
+        waiting: list[tuple[float, int, int, int, int]] = []
+
+        def consider(k: int, only_after: bool) -> None:
+            for other in self.cuts[k]:
+                if other > k or only_after:
+                    a, b = min(k, other), max(k, other)
+                    doubt = self._doubt(a, b, rules)
+                    if doubt > rules.join:
+                        heapq.heappush(waiting, (-doubt, a, b, version[a], version[b]))
+
+        for k in range(len(self.into)):
+            if self.into[k] == k:
+                consider(k, only_after=False)
+        while waiting:
+            _, a, b, version_a, version_b = heapq.heappop(waiting)
+            if self.into[a] != a or self.into[b] != b or version[a] != version_a or version[b] != version_b:
+                continue
+            kept = self._join(a, b)
+            version[kept] += 1
+            consider(kept, only_after=True)
+
+    def _doubt(self, a: int, b: int, rules: RoomRules) -> float:
+        """How little a cut looks like a door."""
+        cut = self.cuts[a][b]
+        means = self.clearance[a] / self.area[a], self.clearance[b] / self.area[b]
+        smaller = a if self.area[a] < self.area[b] else b
+        return float(
+            rules.narrow_weight * min(cut.clearance / min(means), 2.0)
+            + rules.wide_weight * min(cut.clearance / max(means), 2.0)
+            + rules.open_weight * cut.length / self.outline[smaller]
+            - rules.large_weight * cut.clearance * self._cell_m
+            - rules.jamb_weight * min(cut.blunt, 1.0)
+            - rules.edge_weight * min(cut.sharp, 2.0)
+        )
+
+    def _join(self, a: int, b: int) -> int:
+        """Make two pieces one; the larger keeps its number, which is returned."""
+        if (self.area[a], -a) < (self.area[b], -b):
+            a, b = b, a
+        self.into[b] = a
+        self.area[a] += self.area[b]
+        self.clearance[a] += self.clearance[b]
+        self.outline[a] += self.outline[b] - 2.0 * self.cuts[a].pop(b).length
+        for other, cut in self.cuts[b].items():
+            if other == a:
+                continue
+            del self.cuts[other][b]
+            if other in self.cuts[a]:
+                self.cuts[a][other].join(cut)
+            else:
+                self.cuts[a][other] = cut
+                self.cuts[other][a] = cut
+        self.cuts[b] = {}
+        return a
+
+
+def _contacts(basin: I32, squared: I32) -> I32:
+    """(N, 5) pairs of cells side by side in different basins."""
+    found = np.empty((4096, 5), dtype=np.int32)
+    while (n := int(kernels.contacts(basin, squared, found))) > len(found):
+        found = np.empty((n, 5), dtype=np.int32)
+    return found[:n]
+
+
+def _widest_contacts(found: I32, count: int) -> tuple[I32, NDArray[np.int64]]:
+    """(M, 5) the contact of greatest clearance of each pair of basins, first in reading order; (M,) how many it has."""
+    pair = found[:, kernels.LOWER].astype(np.int64) * count + found[:, kernels.UPPER]
+    order = np.lexsort((-found[:, kernels.SQUARED], pair))  # stable: reading order within
+    _, first, lengths = np.unique(pair[order], return_index=True, return_counts=True)
+    return found[order[first]], lengths
+
+
+def _number_rooms(basin: I32, pieces: _Pieces, room_min_cells: float) -> I32:
+    """Labels from basins, in place: rooms from 1 by their first cell in reading order, 0 elsewhere."""
+    name = np.zeros(len(pieces.into) + 1, dtype=np.int32)
+    owners = [pieces.piece_of(k) for k in range(len(pieces.into))]
+    numbers: dict[int, int] = {}
+    values, first = np.unique(basin, return_index=True)
+    for k in values[np.argsort(first)].tolist():
+        if k >= 0 and pieces.area[owners[k]] >= room_min_cells:
+            name[k] = numbers.setdefault(owners[k], len(numbers) + 1)
+    kernels.rename(basin, name)
+    return basin
+
+
+def _describe(labels: I32, squared: I32, order: I32, d: float) -> tuple[Room, ...]:
+    """Rooms of padded labels; cells are of the grid without padding."""
+    area = np.bincount(labels.ravel())
+    by_width = labels.ravel()[order]
+    _, first = np.unique(by_width, return_index=True)
+    widest = {int(by_width[i]): int(order[i]) for i in first}
+    rooms = []
+    for number in range(1, len(area)):
+        row, col = divmod(widest[number], labels.shape[1])
+        clearance_m = math.sqrt(squared[row, col]) * d
+        rooms.append(Room(number, (row - 1, col - 1), clearance_m, float(area[number]) * d * d))
+    return tuple(rooms)
+
+
+def find_doors(labels: I32, field: DistanceField, resolution_m: float) -> tuple[Door, ...]:
+    """Where rooms meet: one door for each run of cells side by side. labels: padded by a cell of 0 on each side."""
+    found = _contacts(np.where(labels > 0, labels, -1).astype(np.int32), field.squared)
+    if not len(found):
+        return ()
+    mask = np.zeros(labels.shape, dtype=np.bool_)
+    mask[found[:, kernels.ROW], found[:, kernels.COL]] = True
+    run = np.empty(labels.shape, dtype=np.int32)
+    kernels.connected(mask, True, run)
+    at = run[found[:, kernels.ROW], found[:, kernels.COL]]
+    order = np.lexsort((-found[:, kernels.SQUARED], at, found[:, kernels.UPPER], found[:, kernels.LOWER]))
+    keys = np.stack((found[:, kernels.LOWER], found[:, kernels.UPPER], at), axis=-1)[order]
+    first = np.flatnonzero(np.append(True, (np.diff(keys, axis=0) != 0).any(axis=1)))
+    doors = []
+    for a, b, _, row, col in found[order[first]].tolist():
+        r0, c0, r1, c1 = (int(v) - 1 for v in kernels.critical_line(field.site, field.squared, row, col, 2))
+        width_m = math.hypot(r1 - r0, c1 - c0) * resolution_m
+        doors.append(Door(a, b, (row - 1, col - 1), ((r0, c0), (r1, c1)), width_m))
+    return tuple(doors)

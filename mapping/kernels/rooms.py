@@ -1,0 +1,282 @@
+"""Compiled loops of the room decomposition (S44): basins of clearance, where they meet, what their passages look like.
+
+    squared (R, C) int32    squared distance to the nearest obstacle in cells, 0 on obstacles
+    site    (R, C) int32    that obstacle, row << 16 | column
+    basin   (R, C) int32    number of the basin a cell belongs to, -1 on obstacles
+
+Run the tests also with NUMBA_BOUNDSCHECK=1 (and a NUMBA_CACHE_DIR of its own) and with NUMBA_DISABLE_JIT=1.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+NO_BASIN = -1
+
+# Columns of a contact: the two basins, squared clearance, row and column of the first cell.
+LOWER, UPPER, SQUARED, ROW, COL = range(5)
+
+
+@njit(cache=True, nogil=True)
+def root(parent: Any, i: Any) -> Any:
+    """The set that i belongs to; shortens the way there."""
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@njit(cache=True, nogil=True)
+def unite(parent: Any, i: Any, j: Any) -> Any:
+    """Make two sets one, named by the smaller root; its name."""
+    a, b = root(parent, i), root(parent, j)
+    if a > b:
+        a, b = b, a
+    parent[b] = a
+    return a
+
+
+@njit(cache=True, nogil=True)
+def connected(mask: Any, diagonal: bool, label: Any) -> Any:
+    """label: (R, C) int32 out, from 0 by first cell in reading order, -1 outside of mask; how many components."""
+    rows, cols = mask.shape
+    parent = np.empty(rows * cols // 2 + 2, dtype=np.int32)
+    n = 0
+    for r in range(rows):
+        for c in range(cols):
+            if not mask[r, c]:
+                label[r, c] = -1
+                continue
+            mine: Any = -1
+            if c > 0 and label[r, c - 1] >= 0:
+                mine = root(parent, label[r, c - 1])
+            if r > 0:
+                for cc in range(max(c - 1, 0), min(c + 2, cols)):
+                    if (cc == c or diagonal) and label[r - 1, cc] >= 0:
+                        other = root(parent, label[r - 1, cc])
+                        mine = other if mine < 0 else unite(parent, mine, other)
+            if mine < 0:
+                mine = n
+                parent[n] = n
+                n += 1
+            label[r, c] = mine
+    name = np.full(n, -1, dtype=np.int32)
+    count = 0
+    for r in range(rows):
+        for c in range(cols):
+            if label[r, c] >= 0:
+                k = root(parent, label[r, c])
+                if name[k] < 0:
+                    name[k] = count
+                    count += 1
+                label[r, c] = name[k]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def boxes(label: Any, box: Any) -> None:
+    """box: (N, 4) out: first row, first column, last row, last column of each component."""
+    rows, cols = label.shape
+    for k in range(box.shape[0]):
+        box[k, 0], box[k, 1], box[k, 2], box[k, 3] = rows, cols, -1, -1
+    for r in range(rows):
+        for c in range(cols):
+            k = label[r, c]
+            if k >= 0:
+                box[k, 0] = min(box[k, 0], r)
+                box[k, 1] = min(box[k, 1], c)
+                box[k, 2] = max(box[k, 2], r)
+                box[k, 3] = max(box[k, 3], c)
+
+
+@njit(cache=True, nogil=True)
+def widest_first(squared: Any) -> Any:
+    """Free cells as row * C + col by falling distance, equal ones in reading order: a counting sort."""
+    rows, cols = squared.shape
+    most = 0
+    for r in range(rows):
+        for c in range(cols):
+            most = max(most, squared[r, c])
+    begins = np.zeros(most + 2, dtype=np.int64)
+    for r in range(rows):
+        for c in range(cols):
+            if squared[r, c] > 0:
+                begins[most - squared[r, c] + 1] += 1
+    for k in range(1, most + 2):
+        begins[k] += begins[k - 1]
+    order = np.empty(begins[most + 1], dtype=np.int32)
+    for r in range(rows):
+        for c in range(cols):
+            if squared[r, c] > 0:
+                k = most - squared[r, c]
+                order[begins[k]] = r * cols + c
+                begins[k] += 1
+    return order
+
+
+@njit(cache=True, nogil=True)
+def flood(squared: Any, order: Any, keep: float, slack: float, basin: Any) -> Any:
+    """Cut free space at its narrow places; how many basins there are. basin: (R, C) int32 out.
+
+    Cells are taken by falling clearance. One that touches no basin begins one; one that touches two is where both
+    meet, at the narrowest point of the widest way between them: the critical point of [Thr98]. They become one there
+    if that point is no narrower than keep * the lesser of the two greatest clearances - slack cells.
+    """
+    rows, cols = squared.shape
+    size = order.size
+    parent = np.empty(size + 1, dtype=np.int32)
+    peak = np.empty(size + 1, dtype=np.float32)
+    basin[:] = NO_BASIN
+    n = 0
+    for i in range(size):
+        r, c = order[i] // cols, order[i] % cols
+        clearance = np.sqrt(np.float32(squared[r, c]))
+        here: Any = -1  # the basin of all that met here
+        mine: Any = -1  # the basin uphill, to which the cell goes
+        steepest = np.int64(-1)
+        for rr in range(max(r - 1, 0), min(r + 2, rows)):
+            for cc in range(max(c - 1, 0), min(c + 2, cols)):
+                if basin[rr, cc] < 0:
+                    continue
+                other = root(parent, basin[rr, cc])
+                rise = 2 * np.int64(squared[rr, cc]) - (rr - r) * (rr - r) - (cc - c) * (cc - c)
+                if rise > steepest:
+                    steepest = rise
+                    mine = other
+                if here < 0:
+                    here = other
+                elif other != here and clearance >= keep * min(peak[other], peak[here]) - slack:
+                    wider, narrower = (other, here) if peak[other] > peak[here] else (here, other)
+                    parent[narrower] = wider
+                    here = wider
+        if mine < 0:
+            mine = n
+            parent[n] = n
+            peak[n] = clearance
+            n += 1
+        basin[r, c] = mine
+    name = np.full(n + 1, -1, dtype=np.int32)
+    count = 0
+    for i in range(size):
+        r, c = order[i] // cols, order[i] % cols
+        k = root(parent, basin[r, c])
+        if name[k] < 0:
+            name[k] = count
+            count += 1
+        basin[r, c] = name[k]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def measure_basins(basin: Any, squared: Any, area: Any, clearance_sum: Any, wall: Any) -> None:
+    """area, clearance_sum, wall: (N,) float64 out, zero before: cells, sum of their distances, outline in cell edges
+    (walls and other basins)."""
+    rows, cols = basin.shape
+    for r in range(rows):
+        for c in range(cols):
+            k = basin[r, c]
+            if k < 0:
+                continue
+            area[k] += 1.0
+            clearance_sum[k] += np.sqrt(np.float64(squared[r, c]))
+            if r == 0 or basin[r - 1, c] != k:
+                wall[k] += 1.0
+            if c == 0 or basin[r, c - 1] != k:
+                wall[k] += 1.0
+            if r == rows - 1 or basin[r + 1, c] != k:
+                wall[k] += 1.0
+            if c == cols - 1 or basin[r, c + 1] != k:
+                wall[k] += 1.0
+
+
+@njit(cache=True, nogil=True)
+def contacts(basin: Any, squared: Any, found: Any) -> Any:
+    """Pairs of cells side by side in different basins; how many. found: (M, 5) int32 out, columns LOWER to COL; what
+    does not fit is counted only."""
+    rows, cols = basin.shape
+    n = 0
+    for r in range(rows):
+        for c in range(cols):
+            a = basin[r, c]
+            if a < 0:
+                continue
+            for down in range(2):
+                rr, cc = r + down, c + 1 - down
+                if rr >= rows or cc >= cols:
+                    continue
+                b = basin[rr, cc]
+                if b < 0 or b == a:
+                    continue
+                if n < found.shape[0]:
+                    found[n, LOWER], found[n, UPPER] = min(a, b), max(a, b)
+                    found[n, SQUARED] = min(squared[r, c], squared[rr, cc])
+                    found[n, ROW], found[n, COL] = r, c
+                n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def count_ruled(site: Any, squared: Any, ruled: Any) -> None:
+    """ruled: (R, C) int32, zero before: free cells whose base point each obstacle cell is."""
+    rows, cols = site.shape
+    for r in range(rows):
+        for c in range(cols):
+            if squared[r, c] > 0 and site[r, c] >= 0:
+                ruled[site[r, c] >> 16, site[r, c] & 0xFFFF] += 1
+
+
+@njit(cache=True, nogil=True)
+def critical_line(site: Any, squared: Any, r: Any, c: Any, reach: int) -> Any:
+    """The base points (row, col, row, col) of a critical point: its own, and the farthest from it that a cell within
+    `reach` cells has."""
+    rows, cols = site.shape
+    own = np.int64(site[r, c])
+    ar, ac = own >> 16, own & 0xFFFF
+    br, bc = ar, ac
+    farthest = np.int64(-1)
+    for rr in range(max(r - reach, 0), min(r + reach + 1, rows)):
+        for cc in range(max(c - reach, 0), min(c + reach + 1, cols)):
+            if squared[rr, cc] == 0 or site[rr, cc] < 0:
+                continue
+            other = np.int64(site[rr, cc])
+            d = ((other >> 16) - ar) ** 2 + ((other & 0xFFFF) - ac) ** 2
+            if d > farthest:
+                farthest = d
+                br, bc = other >> 16, other & 0xFFFF
+    return ar, ac, br, bc
+
+
+@njit(cache=True, nogil=True)
+def jambs(site: Any, squared: Any, ruled: Any, points: Any, ends: Any, sharpness: Any) -> None:
+    """What stands at the ends of critical lines.
+
+    points: (N, 2) critical points.  ends: (N, 4) int32 out, from critical_line.  sharpness: (N, 2) out: cells that
+    rule from the obstacle cells around each end, over the squared clearance: about nothing before a straight wall,
+    0.8 before a corner of 90 degrees, 1.6 and more before the end of a wall; the lesser first.
+    """
+    rows, cols = site.shape
+    for i in range(points.shape[0]):
+        r, c = np.int64(points[i, 0]), np.int64(points[i, 1])
+        line = critical_line(site, squared, r, c, 2)
+        for e in range(2):
+            row, col = line[2 * e], line[2 * e + 1]
+            ends[i, 2 * e], ends[i, 2 * e + 1] = row, col
+            n = 0
+            for rr in range(max(row - 2, 0), min(row + 3, rows)):
+                for cc in range(max(col - 2, 0), min(col + 3, cols)):
+                    n += ruled[rr, cc]
+            sharpness[i, e] = n / squared[r, c]
+        if sharpness[i, 0] > sharpness[i, 1]:
+            sharpness[i, 0], sharpness[i, 1] = sharpness[i, 1], sharpness[i, 0]
+
+
+@njit(cache=True, nogil=True)
+def rename(basin: Any, name: Any) -> None:
+    """Put name[k] in the place of every k >= 0, and name[-1] in that of what is no basin."""
+    rows, cols = basin.shape
+    for r in range(rows):
+        for c in range(cols):
+            basin[r, c] = name[basin[r, c]]
