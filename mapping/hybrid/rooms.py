@@ -46,7 +46,7 @@ class RoomRules:
     wide_weight: float = 0.75
     open_weight: float = 1.1
     large_weight: float = 1.0
-    jamb_weight: float = 0.5
+    jamb_weight: float = 0.55
     edge_weight: float = 0.3
     join: float = 0.15
 

@@ -1,0 +1,194 @@
+"""Rooms of plans whose rooms are known, and the loops behind them against slow references."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from mapping.grids.clearance import DistanceField
+from mapping.hybrid.rooms import RoomMap, RoomRules, find_rooms
+from mapping.kernels import rooms as kernels
+
+Bools = NDArray[np.bool_]
+I32 = NDArray[np.int32]
+
+CELL_M = 0.05
+
+
+def plan() -> tuple[Bools, I32]:
+    """A corridor of 1.6 m, three rooms above it with doors of 1 m, one below; the rooms as drawn."""
+    truth = np.zeros((200, 300), dtype=np.int32)
+    for number, (top, bottom, left, right) in enumerate(
+        ((10, 90, 10, 90), (10, 90, 95, 190), (10, 90, 195, 290), (95, 127, 10, 290), (132, 190, 60, 240)), start=1
+    ):
+        truth[top:bottom, left:right] = number
+    free = truth > 0
+    for left in (40, 140, 230):
+        free[90:95, left : left + 20] = True
+    free[127:132, 100:120] = True
+    return free, truth
+
+
+def furnished() -> Bools:
+    free, _ = plan()
+    random = np.random.default_rng(3)
+    for _ in range(40):
+        row, col = random.integers(15, 80), random.integers(15, 280)
+        free[row : row + random.integers(1, 8), col : col + random.integers(1, 8)] &= not 95 > col > 80
+    free[10:20, 20:50] = False  # a cupboard at the wall
+    return free
+
+
+def numbers_in(found: RoomMap, truth: I32) -> list[int]:
+    """The found room that covers most of each drawn one."""
+    return [int(np.bincount(found.labels[truth == k]).argmax()) for k in range(1, truth.max() + 1)]
+
+
+def test_a_plan_falls_into_its_rooms_at_its_doors() -> None:
+    free, truth = plan()
+    found = find_rooms(free, CELL_M)
+    numbers = numbers_in(found, truth)
+    assert sorted(numbers) == [1, 2, 3, 4, 5] == [room.number for room in found.rooms]
+    for k, number in enumerate(numbers, start=1):
+        drawn, cells = truth == k, found.labels == number
+        assert (cells & drawn).sum() > 0.98 * max(drawn.sum(), cells.sum())
+        assert found.rooms[number - 1].area_m2 == pytest.approx(cells.sum() * CELL_M**2)
+    corridor = numbers[3]
+    beyond = sorted(door.a + door.b - corridor for door in found.doors)
+    assert beyond == sorted(set(numbers) - {corridor})
+    for door in found.doors:
+        assert corridor in (door.a, door.b)
+        assert door.a < door.b
+        assert door.width_m == pytest.approx(1.0, abs=0.1)
+        assert 88 <= door.centre[0] <= 133
+        assert free[door.centre]
+        assert not free[door.ends[0]]
+        assert not free[door.ends[1]]
+
+
+def test_furniture_changes_no_room_and_belongs_to_the_one_it_stands_in() -> None:
+    _, truth = plan()
+    found = find_rooms(furnished(), CELL_M)
+    numbers = numbers_in(found, truth)
+    assert sorted(numbers) == [1, 2, 3, 4, 5]
+    assert len(found.rooms) == 5
+    second = truth == 2
+    assert (found.labels[second] == numbers[1]).mean() > 0.97
+
+
+def test_the_anchor_is_the_widest_place_of_its_room() -> None:
+    free, _ = plan()
+    found = find_rooms(free, CELL_M)
+    distance = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1]
+    for room in found.rooms:
+        assert found.labels[room.anchor] == room.number
+        assert room.clearance_m == pytest.approx(CELL_M * distance[found.labels == room.number].max())
+
+
+def test_what_is_not_free_or_too_small_is_no_room() -> None:
+    assert find_rooms(np.zeros((30, 40), dtype=np.bool_), CELL_M).rooms == ()
+    free = np.zeros((100, 100), dtype=np.bool_)
+    free[40:60, 40:60] = True  # one square metre
+    found = find_rooms(free, CELL_M)
+    assert found.rooms == ()
+    assert not found.labels.any()
+    whole = find_rooms(np.ones((60, 60), dtype=np.bool_), CELL_M)
+    assert len(whole.rooms) == 1
+    assert (whole.labels == 1).all()
+
+
+def test_the_same_grid_gives_the_same_rooms_and_bad_ones_are_refused() -> None:
+    free = furnished()
+    first, second = find_rooms(free, CELL_M), find_rooms(free.copy(), CELL_M)
+    assert np.array_equal(first.labels, second.labels)
+    assert (first.rooms, first.doors) == (second.rooms, second.doors)
+    with pytest.raises(ValueError, match="free cells"):
+        find_rooms(np.ones(5, dtype=np.bool_), CELL_M)
+    with pytest.raises(ValueError, match="resolution"):
+        find_rooms(free, 0.0)
+
+
+def test_rules_say_what_is_furniture_and_what_a_room() -> None:
+    free, _ = plan()
+    free[40:61, 130:151] = False  # more than a metre across
+    assert (find_rooms(free, CELL_M).labels[40:61, 130:151] == 0).any()
+    assert (find_rooms(free, CELL_M, RoomRules(clutter_m=1.05)).labels[40:61, 130:151] > 0).all()
+    assert len(find_rooms(free, CELL_M, RoomRules(room_min_m2=30.0)).rooms) < 5
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("diagonal", [False, True])
+def test_components_are_those_of_scipy(seed: int, diagonal: bool) -> None:
+    random = np.random.default_rng(seed)
+    mask = random.random((random.integers(1, 40), random.integers(1, 40))) < 0.5
+    label = np.empty(mask.shape, dtype=np.int32)
+    count = kernels.connected(mask, diagonal, label)
+    expected, n = ndimage.label(mask, np.ones((3, 3)) if diagonal else None)
+    assert count == n
+    assert np.array_equal(label, expected - 1)
+
+
+def literal_flood(squared: I32, keep: float, slack: float) -> tuple[list[set[tuple[int, int]]], set[tuple[int, int]]]:
+    """Basins by sets of cells instead of union-find, and the cells where two met and stayed apart."""
+    cells = sorted(((-int(v), r, c) for (r, c), v in np.ndenumerate(squared) if v > 0))
+    basins: list[set[tuple[int, int]]] = []
+    met = set()
+    for negative, r, c in cells:
+        clearance = math.sqrt(-negative)
+        near = [
+            (rr, cc) for rr in range(r - 1, r + 2) for cc in range(c - 1, c + 2) if any((rr, cc) in b for b in basins)
+        ]
+        if not near:
+            basins.append({(r, c)})
+            continue
+        uphill = max(near, key=lambda n: (2 * squared[n] - (n[0] - r) ** 2 - (n[1] - c) ** 2, -n[0], -n[1]))
+        next(b for b in basins if uphill in b).add((r, c))
+        here = next(b for b in basins if near[0] in b)
+        for n in near[1:]:
+            other = next(b for b in basins if n in b)
+            if other is here:
+                continue
+            peak = min(max(math.sqrt(squared[k]) for k in b) for b in (here, other))
+            if clearance >= keep * peak - slack:
+                here |= other
+                basins.remove(other)
+            else:
+                met.add((r, c))
+    return basins, met
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_basins_are_those_of_the_slow_flood(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    free = np.pad(random.random((26, 34)) > 0.04, 1)
+    squared = DistanceField(~free).squared
+    basin = np.empty(free.shape, dtype=np.int32)
+    count = kernels.flood(squared, kernels.widest_first(squared), 0.8, 0.25, basin)
+    expected, met = literal_flood(squared, 0.8, 0.25)
+    assert count == len(expected) > 2
+    assert met
+    for cells in expected:
+        numbers = {int(basin[cell]) for cell in cells}
+        assert len(numbers) == 1
+        assert (basin == numbers.pop()).sum() == len(cells)
+    assert (basin[~free] == -1).all()
+
+
+def test_sharpness_tells_a_wall_from_a_corner_from_the_end_of_a_wall() -> None:
+    free = np.zeros((121, 121), dtype=np.bool_)
+    free[20:101, 20:101] = True
+    free[60, :55] = free[60, 67:] = False  # a thin wall with an opening of twelve cells
+    field = DistanceField(~free)
+    ruled = np.zeros(free.shape, dtype=np.int32)
+    kernels.count_ruled(field.site, field.squared, ruled)
+    assert ruled.sum() == free.sum()
+    points = np.array([[60, 60], [40, 60]], dtype=np.int32)
+    ends, sharpness = np.empty((2, 4), dtype=np.int32), np.empty((2, 2))
+    kernels.jambs(field.site, field.squared, ruled, points, ends, sharpness)
+    assert sorted(ends[0].reshape(2, 2).tolist()) == [[60, 54], [60, 67]]
+    assert sharpness[0, 0] > 1.6  # both are ends of walls
+    assert sharpness[1, 0] < 0.5  # midway between straight walls
