@@ -75,12 +75,13 @@ class VoronoiGrid:
         spans = self.field.update(blocked, self._inner(cleared))
         return self._look_again(_one_cell_wider(spans, self.shape[1]))
 
-    def _inner(self, cells: ArrayLike) -> ArrayLike:
-        given = np.asarray(cells)
+    def _inner(self, cells: ArrayLike) -> NDArray[np.integer]:
+        """Cells but for those of the border."""
+        given: NDArray[np.integer] = np.asarray(cells)
         if given.ndim != 2 or given.shape[1] != 2 or not given.size:
             return given
-        last = np.array(self.shape) - 1
-        return given[~((given == 0) | (given == last)).any(axis=1)]
+        on_border: Bools = ((given == 0) | (given == np.array(self.shape) - 1)).any(axis=1)
+        return given[~on_border]
 
     def _look_again(self, spans: I32) -> int:
         gap2 = int(self.gap_cells * self.gap_cells)
