@@ -24,12 +24,12 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
-from functools import partial
+from functools import partial, reduce
 from typing import Literal
 
 from drivers.canopen_sdo import ANSWER_ID, TIMED_OUT, Download, SdoAborted, SdoClient, SdoDone, Upload
 from drivers.conversation import CanFrame, SetBaudRate
-from drivers.readings import ClockFit, Identity, LinkState, Reading, SourceCounters, WheelReading
+from drivers.readings import AngleReading, ClockFit, Identity, LinkState, Reading, SourceCounters, WheelReading
 
 _SYNC_ID = 0x080
 _SYNC = CanFrame(_SYNC_ID)
@@ -86,6 +86,13 @@ class Unwrapper:
         """The next sample follows from nothing."""
         self._raw = None
 
+    @property
+    def absolute(self) -> int | None:
+        """The newest sample as it came, the upper half of the range as below 0; None before the first."""
+        if self._raw is None:
+            return None
+        return self._raw if self._raw < self.range_ticks // 2 else self._raw - self.range_ticks
+
     def advance(self, raw: int, stamp_ns: int) -> bool:
         """Take a sample; True if the total moved on by what was rolled since the last, False if that is not known."""
         before, gap_ns = self._raw, max(stamp_ns - self._stamp_ns, 0)
@@ -127,7 +134,7 @@ class _Node:
         self, node: int, side: str, counters: SourceCounters, *, period_ms: int, max_turns_per_s: float
     ) -> None:
         self.node = node
-        self.name = f"node {node:02X}h ({side} wheel)"
+        self.name = f"node {node:02X}h ({side})"
         self._counters = counters
         self._period_ms = period_ms
         self._life_ns = max(_LIFE_NS, 3 * period_ms * 1_000_000)
@@ -416,25 +423,18 @@ class _Track:
         return x0 + round((x1 - x0) * (stamp_ns - t0) / (t1 - t0))
 
 
-class Cia406PairConversation:
-    """The two wheel encoders of a differential drive. Counts are in the nodes' own directions: signs are configuration.
-
-    sync_rate_hz: of our SYNC, and so of the readings.  produce_sync: False where another member of the bus does it.
-    sampling: see Sampling.  max_turns_per_s: of the encoder's shaft; bounds how long a gap may hide a wrap.
-    """
+class _Cia406Conversation:
+    """Encoders that are read together; subclasses say what is made of a round of counts."""
 
     def __init__(
         self,
-        node_left: int,
-        node_right: int,
+        nodes: Sequence[tuple[int, str]],
         *,
-        sync_rate_hz: float = 100.0,
-        produce_sync: bool = True,
-        sampling: Sampling = "auto",
-        max_turns_per_s: float = 20.0,
+        sync_rate_hz: float,
+        produce_sync: bool,
+        sampling: Sampling,
+        max_turns_per_s: float,
     ) -> None:
-        if node_left == node_right:
-            raise ValueError(f"both wheels are node {node_left:02X}h: each encoder needs a node id of its own")
         if not 1.0 <= sync_rate_hz <= 1000.0:
             raise ValueError(f"sync_rate_hz {sync_rate_hz}: 1 to 1000")
         self._period_ns = round(1e9 / sync_rate_hz)
@@ -444,10 +444,14 @@ class Cia406PairConversation:
         self._last_stamp_ns = -_NEVER
         period_ms = max(1, round(1e3 / sync_rate_hz))
         self._nodes = [
-            _Node(node, side, self._counters, period_ms=period_ms, max_turns_per_s=max_turns_per_s)
-            for node, side in ((node_left, "left"), (node_right, "right"))
+            _Node(node, what, self._counters, period_ms=period_ms, max_turns_per_s=max_turns_per_s)
+            for node, what in nodes
         ]
         self._restart(0)
+
+    def _told(self, stamp_ns: int, totals: Sequence[int], continuous: bool) -> Reading:
+        """The reading of one instant. totals: running counts, by node."""
+        raise NotImplementedError
 
     # ---- what a conversation shows
 
@@ -468,10 +472,10 @@ class Cia406PairConversation:
 
     @property
     def identity(self) -> Identity | None:
-        left, right = (node.identity for node in self._nodes)
-        if left == Identity() or right == Identity():
+        identities = [node.identity for node in self._nodes]
+        if Identity() in identities:
             return None
-        return Identity(*(_both(a, b) for a, b in zip(_fields(left), _fields(right))))
+        return Identity(*(reduce(_both, each) for each in zip(*map(_fields, identities))))
 
     @property
     def clock_fit(self) -> ClockFit | None:
@@ -536,13 +540,13 @@ class Cia406PairConversation:
         for node in self._nodes:
             node.begin(now_ns, cyclic=self._cyclic)
             node.missing = False
-        self._tracks = [_Track(), _Track()]
+        self._tracks = [_Track() for _ in self._nodes]
         self._listen()
         self._pause()
 
     def _listen(self) -> None:
         """Which id means what; others are ignored at the cost of one look-up."""
-        self._handlers: dict[int, Callable[[bytes, int], WheelReading | None]] = {_SYNC_ID: self._take_sync}
+        self._handlers: dict[int, Callable[[bytes, int], Reading | None]] = {_SYNC_ID: self._take_sync}
         for side, node in enumerate(self._nodes):
             self._handlers[node.sync_pdo_id] = partial(self._take_sync_pdo, side)
             self._handlers[node.cyclic_pdo_id] = partial(self._take_timer_pdo, side)
@@ -576,7 +580,7 @@ class Cia406PairConversation:
             return False
         late = now_ns - self._sync_due_ns > self._period_ns
         self._sync_due_ns = (now_ns if late else self._sync_due_ns) + self._period_ns
-        self._round = _Round(now_ns, [None, None])
+        self._round = _Round(now_ns, [None for _ in self._nodes])
         return True
 
     def _answer_limit_ns(self) -> int:
@@ -586,12 +590,12 @@ class Cia406PairConversation:
         if not self._produce_sync:
             if self._round is not None:
                 self._counters.drop("sync_unanswered")
-            self._round = _Round(stamp_ns, [None, None])
+            self._round = _Round(stamp_ns, [None for _ in self._nodes])
         elif self._round is None or self._round.first_answer_ns is not None:  # else it may be the echo of our own
             self._foreign_sync = True
             self._counters.drop("foreign_sync")
 
-    def _take_sync_pdo(self, side: int, data: bytes, stamp_ns: int) -> WheelReading | None:
+    def _take_sync_pdo(self, side: int, data: bytes, stamp_ns: int) -> Reading | None:
         node = self._nodes[side]
         node.hear(stamp_ns)
         if self._cyclic or not self._all_started():
@@ -606,24 +610,24 @@ class Cia406PairConversation:
         current.raw[side] = raw
         if current.first_answer_ns is None:
             current.first_answer_ns = stamp_ns
-        left, right = current.raw
-        if left is None or right is None:
+        answers = [answer for answer in current.raw if answer is not None]
+        if len(answers) < len(self._nodes):
             return None
         self._round = None
         self._deaf_since_ns = stamp_ns
         # Sampled when the nodes heard SYNC: between its sending and the first answer. The way there and back is about
         # equally long (adapter, host), so the middle is right to within half their difference.
-        return self._reading(left, right, (current.sync_ns + current.first_answer_ns) // 2)
+        return self._reading(answers, (current.sync_ns + current.first_answer_ns) // 2)
 
-    def _reading(self, left: int, right: int, stamp_ns: int) -> WheelReading:
+    def _reading(self, answers: Sequence[int], stamp_ns: int) -> Reading:
         stamp_ns = max(stamp_ns, self._last_stamp_ns + 1)
         self._last_stamp_ns = stamp_ns
-        known = [node.unwrapper.advance(raw, stamp_ns) for node, raw in zip(self._nodes, (left, right))]
+        known = [node.unwrapper.advance(raw, stamp_ns) for node, raw in zip(self._nodes, answers)]
         if not self._fresh and not all(known):
             self._counters.drop("discontinuity")
         continuous = all(known) and not self._fresh
         self._fresh = False
-        return WheelReading(stamp_ns, self._nodes[0].unwrapper.total, self._nodes[1].unwrapper.total, continuous)
+        return self._told(stamp_ns, [node.unwrapper.total for node in self._nodes], continuous)
 
     def _notice_deafness(self, now_ns: int) -> None:
         """Both nodes live and are started, but SYNC brings no pair of positions: read them by timer instead."""
@@ -638,7 +642,7 @@ class Cia406PairConversation:
 
     # ---- sampling by timer
 
-    def _take_timer_pdo(self, side: int, data: bytes, stamp_ns: int) -> WheelReading | None:
+    def _take_timer_pdo(self, side: int, data: bytes, stamp_ns: int) -> Reading | None:
         node = self._nodes[side]
         node.hear(stamp_ns)
         if not self._cyclic or not self._all_started():
@@ -653,19 +657,19 @@ class Cia406PairConversation:
         track.before, track.newest = track.newest, (stamp_ns, node.unwrapper.total)
         return self._interpolated()
 
-    def _interpolated(self) -> WheelReading | None:
-        """Both totals at the newest time that both are known for: the one that spoke later is interpolated."""
-        left, right = self._tracks
-        if left.newest is None or right.newest is None:
+    def _interpolated(self) -> Reading | None:
+        """All totals at the newest time that all are known for: those that spoke later are interpolated."""
+        newest = [track.newest for track in self._tracks if track.newest is not None]
+        if len(newest) < len(self._tracks):
             return None
-        stamp_ns = min(left.newest[0], right.newest[0])
-        left_ticks, right_ticks = left.at(stamp_ns), right.at(stamp_ns)
-        if stamp_ns <= self._last_stamp_ns or left_ticks is None or right_ticks is None:
+        stamp_ns = min(stamp for stamp, _ in newest)
+        totals = [total for track in self._tracks if (total := track.at(stamp_ns)) is not None]
+        if stamp_ns <= self._last_stamp_ns or len(totals) < len(self._tracks):
             return None
         self._last_stamp_ns = stamp_ns
         continuous = not self._fresh
         self._fresh = False
-        return WheelReading(stamp_ns, left_ticks, right_ticks, continuous)
+        return self._told(stamp_ns, totals, continuous)
 
     # ---- the rest of the nodes' frames
 
@@ -684,6 +688,59 @@ class Cia406PairConversation:
     def _take_emergency(self, node: _Node, data: bytes, now_ns: int) -> None:
         node.hear(now_ns)
         node.take_emergency(data)
+
+
+class Cia406PairConversation(_Cia406Conversation):
+    """The two wheel encoders of a differential drive. Counts are in the nodes' own directions: signs are configuration.
+
+    sync_rate_hz: of our SYNC, and so of the readings.  produce_sync: False where another member of the bus does it.
+    sampling: see Sampling.  max_turns_per_s: of the encoder's shaft; bounds how long a gap may hide a wrap.
+    """
+
+    def __init__(
+        self,
+        node_left: int,
+        node_right: int,
+        *,
+        sync_rate_hz: float = 100.0,
+        produce_sync: bool = True,
+        sampling: Sampling = "auto",
+        max_turns_per_s: float = 20.0,
+    ) -> None:
+        if node_left == node_right:
+            raise ValueError(f"both wheels are node {node_left:02X}h: each encoder needs a node id of its own")
+        super().__init__(
+            ((node_left, "left wheel"), (node_right, "right wheel")),
+            sync_rate_hz=sync_rate_hz,
+            produce_sync=produce_sync,
+            sampling=sampling,
+            max_turns_per_s=max_turns_per_s,
+        )
+
+    def _told(self, stamp_ns: int, totals: Sequence[int], continuous: bool) -> WheelReading:
+        left, right = totals
+        return WheelReading(stamp_ns, left, right, continuous)
+
+
+class Cia406AxleConversation(_Cia406Conversation):
+    """One encoder whose count is an angle, as on the axle of a nodding mount: read by its own timer, so that it needs
+    no SYNC and shares a bus with wheels that have one. The arguments as above."""
+
+    def __init__(self, node: int, *, rate_hz: float = 100.0, max_turns_per_s: float = 20.0) -> None:
+        self._offset = 0
+        super().__init__(
+            ((node, "axle"),),
+            sync_rate_hz=rate_hz,
+            produce_sync=False,
+            sampling="cyclic",
+            max_turns_per_s=max_turns_per_s,
+        )
+
+    def _told(self, stamp_ns: int, totals: Sequence[int], continuous: bool) -> AngleReading:
+        absolute = self._nodes[0].unwrapper.absolute
+        if not continuous and absolute is not None:
+            self._offset = absolute - totals[0]
+        return AngleReading(stamp_ns, totals[0] + self._offset, continuous)
 
 
 def _fields(identity: Identity) -> tuple[str, str, str, str]:

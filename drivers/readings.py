@@ -105,6 +105,19 @@ class WheelReading:
     continuous: bool
 
 
+@dataclass(frozen=True, slots=True)
+class AngleReading:
+    """The absolute count of an encoder on an axle at one instant, in the device's own counting direction.
+
+    It goes on below 0 and through full turns as long as continuous is True; else the count starts anew from what the
+    device says (0 to half its range as it is, above that as below 0), and what lay between is unknown.
+    """
+
+    stamp_ns: int
+    ticks: int
+    continuous: bool
+
+
 class ContactState(IntEnum):
     """What a switch says: of a bumper that it touches, of a cliff sensor that the floor is missing."""
 
@@ -159,7 +172,7 @@ class AttitudeReading:
     rates_rad_s: tuple[float, float, float]
 
 
-Reading = ScanReading | ChainReading | WheelReading | ContactReading | PoseReading | AttitudeReading
+Reading = ScanReading | ChainReading | WheelReading | AngleReading | ContactReading | PoseReading | AttitudeReading
 
 
 class LinkState(IntEnum):

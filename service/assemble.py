@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +16,10 @@ import numpy as np
 from drivers.conversation import Conversation
 from drivers.ports import Clock, Port, Tap
 from drivers.reader import Sink, WireReader
-from drivers.readings import ChainReading, RangeReading, RangeStatus, Reading, ScanReading, WheelReading
-from mapping.frames import Pose2
+from drivers.readings import AngleReading, ChainReading, RangeReading, RangeStatus, Reading, ScanReading, WheelReading
+from mapping.frames import Pose2, Pose3
 from mapping.odometry import DriveGeometry
+from mapping.planes.cloud import TiltMount
 from service.config import Config
 from service.config_base import PlanePose
 from service.config_devices import (
@@ -27,6 +28,7 @@ from service.config_devices import (
     ArduinoSonars,
     ArduinoWheels,
     CanBus,
+    Cia406Mount,
     Cia406Wheels,
     Device,
     Drive,
@@ -47,11 +49,13 @@ from service.config_devices import (
     tcp_address,
 )
 from service.fusion import SECTOR_MEMORY_NS, Fusion, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer
-from service.sensors import Chain, Laser, Sensor, Transducer, Wheels
+from service.mounts import MountSettings, TiltingLaser
+from service.sensors import AxleEncoder, Chain, Laser, Sensor, Transducer, Wheels
 
 if TYPE_CHECKING:
     from drivers.encoder_arduino_bridge import ArduinoBridgeConversation
     from drivers.mavlink_in import MavlinkConversation
+    from mapping.planes.extract import PlaneRules
     from service.background import Submit
     from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
     from service.map_makers import MapMaker
@@ -85,6 +89,10 @@ def sensors(config: Config) -> dict[str, Sensor]:
     for section, name, device in config.devices():
         source = config.source_name(section, name)
         found[source] = _sensor_of(source, device)
+    for mount in config.mounts.values():
+        laser = found[mount.laser]
+        assert isinstance(laser, Laser)
+        found[mount.laser] = replace(laser, tilts=True)
     return found
 
 
@@ -325,6 +333,10 @@ def conversation_of(device: Device) -> Conversation[Any]:
                 sampling=device.sampling,
                 max_turns_per_s=device.max_turns_per_s,
             )
+        case Cia406Mount():
+            from drivers.encoder_cia406 import Cia406AxleConversation
+
+            return Cia406AxleConversation(device.node, rate_hz=device.rate_hz, max_turns_per_s=device.max_turns_per_s)
         case RoboClawWheels():
             from drivers.encoder_roboclaw import RoboClawConversation
 
@@ -401,6 +413,8 @@ def _sensor_of(source: str, device: Device) -> Sensor:
             )
         case Cia406Wheels() | ArduinoWheels() | RoboClawWheels() | ODriveWheels() | VescWheels() | MavlinkWheels():
             return Wheels(source)
+        case Cia406Mount():
+            return AxleEncoder(source)
         case _:
             raise TypeError(f"no sensor for {type(device).__name__}")
 
@@ -452,6 +466,10 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
 def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
     """The maps that are made on the slow thread."""
     makers: list[MapMaker] = []
+    if config.planes.enabled and config.mounts:
+        from service.plane_maker import PlaneMaker
+
+        makers.append(PlaneMaker(_plane_rules(config), period_ns=round(config.planes.period_s * 1e9)))
     lasers = frozenset(name for name, sensor in found.items() if isinstance(sensor, Laser))
     if config.lines.enabled and (fed_by := lasers & _sources(config, config.lines.sources, found)):
         from mapping.lines.line_map import LineMap
@@ -461,6 +479,43 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         period_ns = round(lines.period_s * 1e9)
         makers.append(LineMaker(LineMap(), fed_by, period_ns=period_ns, min_seen=lines.min_scans))
     return makers
+
+
+def _plane_rules(config: Config) -> PlaneRules:
+    from mapping.planes.extract import PlaneRules, RangeNoise
+
+    wanted = config.planes
+    return PlaneRules(
+        cell_m=wanted.cell_m,
+        min_points=wanted.min_points,
+        min_cells=wanted.min_cells,
+        inlier_m=wanted.inlier_m,
+        noise=None if wanted.sigma_m is None else RangeNoise(wanted.sigma_m),
+    )
+
+
+def tilting_lasers(config: Config) -> tuple[TiltingLaser, ...]:
+    """The mounts that nod or turn a laser."""
+    return tuple(TiltingLaser(_mount_settings(config, name)) for name in sorted(config.mounts))
+
+
+def _mount_settings(config: Config, name: str) -> MountSettings:
+    device = config.mounts[name]
+    place, arm = device.mount, device.arm
+    roll = math.pi if place.upside_down else 0.0
+    return MountSettings(
+        name=config.source_name("mounts", name),
+        laser=config.source_name("lasers", device.laser),
+        mount=TiltMount(
+            Pose3(place.x_m, place.y_m, place.z_m, roll, 0.0, math.radians(place.yaw_deg)),
+            device.axle,
+            Pose3(arm.x_m, arm.y_m, arm.z_m, *map(math.radians, (arm.roll_deg, arm.pitch_deg, arm.yaw_deg))),
+        ),
+        rad_per_tick=2.0 * math.pi / device.counts_per_turn,
+        zero_rad=math.radians(device.zero_deg),
+        turning=device.motion == "turns",
+        wait_ns=config.alignment.odometry_wait_ms * 1_000_000,
+    )
 
 
 def _artos_map(config: Config, polar: Sequence[PolarLayer]) -> ArtosLayer:
@@ -527,6 +582,7 @@ def parts(config: Config, found: Mapping[str, Sensor], made: Maps, localiser: Lo
         drive=drive,
         max_wheel_speed_m_s=config.drive.max_wheel_speed_m_s,
         localiser=localiser,
+        mounts=tilting_lasers(config),
         wait_ns=config.alignment.odometry_wait_ms * 1_000_000,
         odometry_memory_s=config.alignment.odometry_memory_s,
     )
@@ -544,7 +600,11 @@ def localiser(
 
     submit: where slow work is done.  on_redrawn: see Redrawer.
     """
-    lasers = {name: sensor.base_from_sensor for name, sensor in found.items() if isinstance(sensor, Laser)}
+    lasers = {
+        name: sensor.base_from_sensor
+        for name, sensor in found.items()
+        if isinstance(sensor, Laser) and not sensor.tilts
+    }
     matched = lasers.keys() & _sources(config, config.slam.sources, found)
     if not config.slam.enabled or not matched:
         return OdometryOnly(start_pose)
@@ -574,7 +634,11 @@ def geometry_of(drive: Drive) -> DriveGeometry:
 
 def _sources(config: Config, references: Sequence[str] | None, found: Mapping[str, Sensor]) -> frozenset[str]:
     if references is None:
-        return frozenset(name for name, sensor in found.items() if isinstance(sensor, Laser | Chain))
+        return frozenset(
+            name
+            for name, sensor in found.items()
+            if isinstance(sensor, Chain) or (isinstance(sensor, Laser) and not sensor.tilts)
+        )
     return frozenset(config.source_name(*config.resolve(reference)) for reference in references)
 
 
@@ -631,6 +695,10 @@ def warm_up(config: Config) -> None:
         from mapping.lines.warm_up import warm_up as warm_up_lines
 
         warm_up_lines()
+    if config.planes.enabled and config.mounts:
+        from mapping.planes.warm_up import warm_up as warm_up_planes
+
+        warm_up_planes()
     if config.slam.enabled and any(isinstance(sensor, Laser) for sensor in found.values()):
         from mapping.localise.warm_up import warm_up as warm_up_slam
 
@@ -659,3 +727,5 @@ def _pretended(sensor: Sensor, step: int, now_ns: int) -> Reading:
             return ChainReading(now_ns, ranges)
         case Wheels():
             return WheelReading(now_ns, 100 * step, 100 * step, True)
+        case AxleEncoder():
+            return AngleReading(now_ns, 10 * step, step > 0)

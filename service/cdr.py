@@ -137,6 +137,15 @@ class Diagnostics:
     statuses: tuple[Status, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """sensor_msgs/msg/PointCloud2 of x, y, z as 4-byte numbers, one row. points_m: (N, 3)."""
+
+    stamp_ns: int
+    frame: str
+    points_m: F32
+
+
 class _Writer:
     """Appends aligned values. Positions count from after the four header bytes, as buf does."""
 
@@ -285,6 +294,28 @@ def encode_diagnostics(diagnostics: Diagnostics) -> bytes:
     return w.message()
 
 
+_FLOAT32 = 7  # of PointField
+_POINT_BYTES = 12
+
+
+def encode_cloud(cloud: Cloud) -> bytes:
+    """The bytes of a PointCloud2; dense: all points are finite."""
+    w = _Writer()
+    w.header(cloud.stamp_ns, cloud.frame)
+    count = len(cloud.points_m)
+    w.pack(4, "<III", 1, count, 3)
+    for number, axis in enumerate("xyz"):
+        w.string(axis)
+        w.pack(4, "<I", 4 * number)
+        w.pack(1, "<B", _FLOAT32)
+        w.pack(4, "<I", 1)
+    w.pack(1, "<B", 0)  # little endian
+    w.pack(4, "<III", _POINT_BYTES, _POINT_BYTES * count, _POINT_BYTES * count)
+    w.buf += np.ascontiguousarray(cloud.points_m, dtype="<f4").tobytes()
+    w.pack(1, "<B", 1)
+    return w.message()
+
+
 class _Reader:
     """Takes aligned values; every length is checked against what is left before anything is made of it."""
 
@@ -373,6 +404,25 @@ def decode_grid_update(payload: bytes) -> GridUpdate:
     x, y = struct.unpack("<ii", r.take(4, 8))
     columns, rows = r.uint(), r.uint()
     return GridUpdate(stamp_ns, frame, x, y, r.cells(rows, columns))
+
+
+def decode_cloud(payload: bytes) -> Cloud:
+    """A PointCloud2 whose fields are x, y, z as 4-byte numbers, in this order and little endian."""
+    r = _Reader(payload)
+    stamp_ns, frame = r.stamp(), r.string()
+    rows, columns = r.uint(), r.uint()
+    fields = []
+    for _ in range(_bounded(r, 13)):
+        name, (offset,), kind, (number,) = r.string(), r.unpack(4, "<I"), r.take(1, 1)[0], r.unpack(4, "<I")
+        fields.append((name, offset, kind, number))
+    big_endian = r.take(1, 1)[0]
+    point_bytes, _, size = r.uint(), r.uint(), r.uint()
+    if big_endian or fields != [(axis, 4 * k, _FLOAT32, 1) for k, axis in enumerate("xyz")]:
+        raise CdrError(f"a cloud of {[name for name, *_ in fields]}, not of x, y, z as 4-byte numbers")
+    if point_bytes != _POINT_BYTES or size != rows * columns * _POINT_BYTES:
+        raise CdrError(f"{size} bytes for {rows * columns} points of {point_bytes}")
+    points = np.frombuffer(r.take(1, size), dtype="<f4").astype(np.float32).reshape(-1, 3)
+    return Cloud(stamp_ns, frame, points)
 
 
 def decode_pose(payload: bytes) -> PoseWithCovariance:

@@ -17,14 +17,33 @@ from pydantic import Field, ValidationError
 
 from service.config_around import Log, Mavlink, Network, RecordingSettings, Ros, Search, Store
 from service.config_base import Name, Section
-from service.config_devices import SHARED_DRIVERS, CanBus, Device, Drive, LaserDevice, Robot, SonarDevice, WheelDevice
+from service.config_devices import (
+    SHARED_DRIVERS,
+    CanBus,
+    Cia406Mount,
+    Device,
+    Drive,
+    LaserDevice,
+    Robot,
+    SonarDevice,
+    WheelDevice,
+)
 from service.config_faults import Fault, faults_of, without_faults
 from service.config_files import KeyPath, Layers, find_config, origin_of, read_layers
-from service.config_maps import Alignment, Artos, Grid, LineMapSettings, LocalGrid, SectorMaps, SlamLive
+from service.config_maps import (
+    Alignment,
+    Artos,
+    Grid,
+    LineMapSettings,
+    LocalGrid,
+    PlaneMapSettings,
+    SectorMaps,
+    SlamLive,
+)
 from service.errors import WrongUsage
 
 SENSOR_SECTIONS = ("lasers", "sonars")
-DEVICE_SECTIONS = (*SENSOR_SECTIONS, "wheels")
+DEVICE_SECTIONS = (*SENSOR_SECTIONS, "wheels", "mounts")
 
 
 class Config(Section):
@@ -36,11 +55,13 @@ class Config(Section):
     lasers: dict[Name, LaserDevice] = Field(default={}, description="Laser rangefinders by name.")
     sonars: dict[Name, SonarDevice] = Field(default={}, description="Ultrasonic chains by name.")
     wheels: dict[Name, WheelDevice] = Field(default={}, description="Wheel encoders by name.")
+    mounts: dict[Name, Cia406Mount] = Field(default={}, description="Mounts that nod or turn a laser, by name.")
     sectors: SectorMaps = Field(default=SectorMaps(), description="Sector maps.")
     grid: Grid = Field(default=Grid(), description="The grid of the whole building.")
     local_grid: LocalGrid = Field(default=LocalGrid(), description="The grid around the robot.")
     artos: Artos = Field(default=Artos(), description="The ARTOS two-step map.")
     lines: LineMapSettings = Field(default=LineMapSettings(), description="The map of walls as lines.")
+    planes: PlaneMapSettings = Field(default=PlaneMapSettings(), description="Planes of tilting lasers.")
     slam: SlamLive = Field(default=SlamLive(), description="Where the robot is, by laser scans.")
     alignment: Alignment = Field(default=Alignment(), description="How long readings wait for each other.")
     network: Network = Field(default=Network(), description="The Zenoh router.")
@@ -62,10 +83,10 @@ class Config(Section):
     def source_name(self, section: str, name: str) -> str:
         """The one name of a device in keys and reports: its own, with its section before it if an earlier one has it.
 
-        lasers come before sonars, sonars before wheels: with [lasers.front] and [sonars.front] these are `front` and
-        `sonars-front`.
+        lasers come before sonars, sonars before wheels, wheels before mounts: with [lasers.front] and [sonars.front]
+        these are `front` and `sonars-front`.
         """
-        earlier = {"lasers": (), "sonars": ("lasers",), "wheels": ("lasers", "sonars")}[section]
+        earlier = DEVICE_SECTIONS[: DEVICE_SECTIONS.index(section)]
         return f"{section}-{name}" if any(name in getattr(self, other) for other in earlier) else name
 
     def resolve(self, reference: str) -> tuple[str, str]:
@@ -228,11 +249,19 @@ def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
             bus = device.get("can")
             if isinstance(bus, str) and bus not in _table(data, "can"):
                 yield _missing((section, name, "can"), bus, "can", data)
+    tilting = {table.get("laser"): name for name, table in _tables(data, "mounts")}
+    for name, table in _tables(data, "mounts"):
+        laser = table.get("laser")
+        if isinstance(laser, str) and laser not in _table(data, "lasers"):
+            yield _missing(("mounts", name, "laser"), laser, "lasers", data)
+        elif isinstance(laser, str) and tilting[laser] != name:
+            yield Fault(("mounts", name, "laser"), f"{laser} is on mounts.{tilting[laser]} already; each has its own")
     for path, table in (
         *((("sectors", "polar", name), table) for name, table in _tables(data, "sectors", "polar")),
         *((("sectors", "rect", name), table) for name, table in _tables(data, "sectors", "rect")),
         (("grid",), _table(data, "grid")),
         (("local_grid",), _table(data, "local_grid")),
+        (("lines",), _table(data, "lines")),
         (("slam",), _table(data, "slam")),
     ):
         for reference in _texts(table.get("sources")):
@@ -240,6 +269,11 @@ def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
             if not any(name in _table(data, each) for each in ((section,) if dot else SENSOR_SECTIONS)):
                 known = [f"{each}.{one}" for each in SENSOR_SECTIONS for one in sorted(_table(data, each))]
                 text = f"there is no sensor {reference}; name one of: {', '.join(known) or '(none yet)'}"
+                yield Fault((*path, "sources"), text)
+            elif section != "sonars" and name in tilting and name in _table(data, "lasers"):
+                text = (
+                    f"the laser {name} is tilted by mounts.{tilting[name]}: it makes clouds, and goes into no flat map"
+                )
                 yield Fault((*path, "sources"), text)
     sent = _table(data, "mavlink").get("map")
     if isinstance(sent, str) and sent not in _table(data, "sectors", "polar"):

@@ -445,6 +445,53 @@ class Cia406Wheels(Device):
         return self
 
 
+class Arm(Section):
+    """Where a laser sits on its mount, seen from the axle, when the mount's angle is 0."""
+
+    x_m: float = Field(default=0.0, description="Forward of the axle.")
+    y_m: float = Field(default=0.0, description="Left of the axle.")
+    z_m: float = Field(default=0.0, description="Above the axle.")
+    roll_deg: float = Field(default=0.0, ge=-360, le=360, description="Turned about its forward axis; 90: on its side.")
+    pitch_deg: float = Field(default=0.0, ge=-360, le=360, description="Then about the left axis; positive looks down.")
+    yaw_deg: float = Field(default=0.0, ge=-360, le=360, description="Then about the vertical.")
+
+
+class Cia406Mount(Device):
+    """A mount that nods or turns a laser, with a CANopen encoder (CiA 406) on its axle: key cloud/NAME."""
+
+    driver: Literal["cia406"] = Field(description="Says that it is this kind of device.")
+    can: Name = Field(description="The [can.NAME] the encoder is on.")
+    node: int = Field(default=0x30, ge=1, le=127, description="Node id of the encoder.")
+    laser: Name = Field(description="The [lasers.NAME] on it; where that sits is said here, by mount and arm.")
+    axle: Literal["pitch", "roll", "yaw"] = Field(
+        default="pitch", description="pitch nods, roll turns about the direction it looks in, yaw about the vertical."
+    )
+    motion: Literal["nods", "turns"] = Field(
+        default="nods", description="nods: a cloud from turning point to turning point; turns: a cloud each turn."
+    )
+    mount: Mount = Field(default=Mount(), description="Where the axle is.")
+    arm: Arm = Field(default=Arm(), description="Where the laser is on the axle.")
+    counts_per_turn: float = Field(
+        default=4096.0, description="Counts per turn of the axle, gear included; negative if they fall looking down."
+    )
+    zero_deg: float = Field(default=0.0, ge=-360, le=360, description="The mount's angle where the count is 0.")
+    rate_hz: float = Field(default=100.0, ge=10, le=200, description="Angles a second, by the encoder's own timer.")
+    max_turns_per_s: Positive = Field(
+        default=20.0, description="Of the encoder's shaft; bounds how long a gap may hide that the count wrapped."
+    )
+
+    @field_validator("counts_per_turn")
+    @classmethod
+    def _not_zero(cls, counts: float) -> float:
+        if counts == 0:
+            raise ValueError("counts per turn cannot be 0; take them from the encoder's data sheet, times the gear")
+        return counts
+
+    def can_ids(self) -> frozenset[int]:
+        """The predefined connection set of the node."""
+        return frozenset(base + self.node for base in (0x080, 0x180, 0x280, 0x580, 0x600, 0x700))
+
+
 class ArduinoWheels(Device):
     """Wheel counts of a board with the text protocol of ros_arduino_bridge."""
 

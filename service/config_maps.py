@@ -104,6 +104,18 @@ class LineMapSettings(Section):
     min_scans: int = Field(default=2, ge=1, le=255, description="Scans that must have seen a line before it is told.")
 
 
+class PlaneMapSettings(Section):
+    """Planes of what nodding and turning lasers see: key map/planes, if there is a [mounts.NAME]."""
+
+    enabled: bool = Field(default=True, description="Look for them.")
+    period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two that are published.")
+    cell_m: float = Field(default=0.2, ge=0.02, le=5.0, description="Edge of a cubic cell.")
+    min_points: int = Field(default=10, ge=3, le=1000, description="Points of a cell, to look for a plane in it.")
+    min_cells: int = Field(default=10, ge=1, le=10000, description="A plane has at least so many times min_points.")
+    inlier_m: Positive = Field(default=0.05, description="Farthest that a point of a plane is off.")
+    sigma_m: Positive | None = Field(default=None, description="Noise of ranges; default: taken from each cloud.")
+
+
 class SlamLive(Section):
     """Where the robot is: found by laying laser scans on each other, not by the wheels alone."""
 

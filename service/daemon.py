@@ -217,7 +217,7 @@ class Daemon:
         ros = RosSettings(
             distro=config.ros.distro,
             domain_id=config.ros.domain_id,
-            lasers=tuple(sensor.name for sensor in self._sensors.values() if isinstance(sensor, Laser)),
+            lasers=tuple(s.name for s in self._sensors.values() if isinstance(s, Laser) and not s.tilts),
         )
         return Publisher(
             f"robots/{config.robot.id}",
@@ -394,7 +394,7 @@ def robot_info(config: Config, started_ns: int) -> RobotInfo:
     """What the `info` document says of a configuration. started_ns: wall clock."""
     places: list[SensorPlace] = []
     for sensor in assemble.sensors(config).values():
-        if isinstance(sensor, Laser):
+        if isinstance(sensor, Laser) and not sensor.tilts:
             places.append(SensorPlace(sensor.name, sensor.kind, sensor.base_from_sensor, sensor.height_m))
         elif isinstance(sensor, Chain):
             places.extend(

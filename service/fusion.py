@@ -28,15 +28,25 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.readings import ChainReading, DeviceEvent, LinkState, RangeStatus, Reading, ScanReading, WheelReading
+from drivers.readings import (
+    AngleReading,
+    ChainReading,
+    DeviceEvent,
+    LinkState,
+    RangeStatus,
+    Reading,
+    ScanReading,
+    WheelReading,
+)
 from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
 from mapping.odometry import DifferentialOdometry, DriveGeometry, OdometryState
 from mapping.pose_buffer import GoneError, PoseBuffer
 from mapping.scan import Scan
 from service.align import WaitingRoom
+from service.mounts import TiltingLaser
 from service.outputs import OdomOut, Output, PolarOut, PoseOut, RangesOut, RectOut, ScanOut
-from service.sensors import Chain, Laser, Sensor, Wheels
+from service.sensors import AxleEncoder, Chain, Laser, Sensor, Wheels
 
 F64 = NDArray[np.float64]
 
@@ -224,6 +234,7 @@ class Parts:
     drive: tuple[str, DriveGeometry] | None = None
     max_wheel_speed_m_s: float = 5.0
     localiser: Localiser = field(default_factory=OdometryOnly)
+    mounts: Sequence[TiltingLaser] = ()
     wait_ns: int = 500_000_000
     odometry_memory_s: float = 30.0
 
@@ -251,6 +262,8 @@ class Fusion:
         self._sectors_untold: set[int] = set()  # changed since they were published
         self._newest_stamp_ns = 0
         self._late_since_ns: int | None = None
+        self._tilting = {mount.settings.laser: mount for mount in parts.mounts}
+        self._by_axle = {mount.settings.name: mount for mount in parts.mounts}
         self._held: deque[tuple[str, Scan | Round]] = deque()  # covered, until the localiser is ready
 
     # --- what comes in
@@ -267,6 +280,12 @@ class Fusion:
         if sensor is None:
             return self._drop(source, "not_configured")
         match sensor, item:
+            case Laser(tilts=True), ScanReading():
+                return self._on_tilted_scan(sensor, item, now_ns)
+            case AxleEncoder(), AngleReading():
+                if self._is_newer(source, item.stamp_ns, now_ns) and source in self._by_axle:
+                    self._by_axle[source].take_angle(item)
+                return []
             case Laser(), ScanReading():
                 return self._on_scan(sensor, item, now_ns) if self._is_newer(source, item.stamp_ns, now_ns) else []
             case Wheels(), WheelReading():
@@ -290,6 +309,7 @@ class Fusion:
         self.settle(now_ns)
         outputs.extend(self._pose_by_scans())
         outputs.extend(self._parts.localiser.outputs(now_ns))
+        outputs.extend(self._clouds(now_ns))
         map_from_base = self._map_from_base_now()
         for grid in self._parts.grids:
             outputs.extend(grid.outputs(map_from_base, self._newest_stamp_ns, now_ns))
@@ -324,6 +344,8 @@ class Fusion:
             return []
         if event.state is LinkState.STARTING and source in self._chains:
             self._chains[source].forget()
+        if source in self._by_axle:
+            self._by_axle[source].lose()
         self._lose(source)
         return [self._tell(index, now_ns) for index in self._fed_by(source)]
 
@@ -353,6 +375,36 @@ class Fusion:
         yield ScanOut(laser.name, scan, laser.base_from_sensor, laser.height_m)
         self._newest_stamp_ns = max(self._newest_stamp_ns, scan.stamp_ns)
         self._wait_for_poses(laser.name, scan, scan.stamp_ns, _last_beam_ns(scan), now_ns)
+
+    def _on_tilted_scan(self, laser: Laser, reading: ScanReading, now_ns: int) -> list[Output]:
+        """A sweep that is not level goes into no flat map."""
+        mount = self._tilting.get(laser.name)
+        if mount is None or not self._is_newer(laser.name, reading.stamp_ns, now_ns):
+            return []
+        scan = self._checked_scan(laser, reading)
+        if scan is not None:
+            mount.take_scan(scan, now_ns)
+            self._newest_stamp_ns = max(self._newest_stamp_ns, scan.stamp_ns)
+        return []
+
+    def _clouds(self, now_ns: int) -> list[Output]:
+        poses = None if self._odometry is None else self._poses
+        made: list[Output] = []
+        for mount in self._parts.mounts:
+            made.extend(mount.clouds(poses, self._map_from_base_at, now_ns))
+            for reason, count in mount.drops.items():
+                self._drop(mount.settings.name, reason, count)
+            mount.drops.clear()
+        return made
+
+    def _map_from_base_at(self, stamp_ns: int) -> Pose2 | None:
+        map_from_odom = self._parts.localiser.map_from_odom()
+        if self._odometry is None:
+            return map_from_odom
+        try:
+            return map_from_odom @ self._poses.at(stamp_ns)
+        except LookupError:
+            return None
 
     def _checked_scan(self, laser: Laser, reading: ScanReading) -> Scan | None:
         bearing = np.asarray(reading.bearing_rad, dtype=np.float64)

@@ -27,7 +27,7 @@ from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service.errors import Trouble
 from service.fusion import Round
-from service.outputs import GridOut, GridUpdateOut, Output, PoseOut
+from service.outputs import CloudOut, GridOut, GridUpdateOut, Output, PoseOut
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +35,7 @@ F64 = NDArray[np.float64]
 T = TypeVar("T")
 
 SWEEPS_WAITING_MAX = 128
+_CLOUDS_WAITING_MAX = 4
 _GRIDS_WAITING_MAX = 256
 _TURN_S = 0.1
 _ASK_LIMIT_S = 10.0
@@ -102,6 +103,14 @@ class DrawnFromSweeps(Protocol):
         """Forget the map: every sweep that was kept follows, where it lies now."""
 
 
+@runtime_checkable
+class MadeOfClouds(Protocol):
+    """A maker that also wants the clouds of tilting lasers."""
+
+    def take_cloud(self, cloud: CloudOut) -> None:
+        """One nod or turn of a mount."""
+
+
 @dataclass(slots=True)
 class _Desk:
     """What the thread remembers of one maker."""
@@ -124,6 +133,7 @@ class MapMakers:
         self._sweeps: deque[Sweep] = deque()
         self._redrawn: Sequence[Callable[[], Sweep]] | None = None
         self._grids: deque[GridOut | GridUpdateOut] = deque()
+        self._clouds: deque[CloudOut] = deque()
         self._asked: deque[tuple[Callable[[], object], threading.Event, list[object]]] = deque()
         self._changed = threading.Condition()
         self._stopping = False
@@ -131,7 +141,7 @@ class MapMakers:
         self._mirror = _Mirror()
         self._pose: PoseOut | None = None
         self._complained: set[str] = set()
-        self.counts = {"makers.sweeps_lost": 0, "makers.grids_lost": 0, "makers.errors": 0}
+        self.counts = {"makers.sweeps_lost": 0, "makers.grids_lost": 0, "makers.clouds_lost": 0, "makers.errors": 0}
 
     @property
     def sources(self) -> frozenset[str]:
@@ -172,8 +182,14 @@ class MapMakers:
             self._sweeps.clear()  # those that were kept are among them
 
     def take_output(self, output: Output) -> None:
-        """Everything that is published passes here; grids and poses are of use. Never blocks."""
+        """Everything that is published passes here; grids, clouds and poses are of use. Never blocks."""
         match output:
+            case CloudOut():
+                with self._changed:
+                    self._clouds.append(output)
+                    if len(self._clouds) > _CLOUDS_WAITING_MAX:
+                        self._clouds.popleft()
+                        self.counts["makers.clouds_lost"] += 1
             case PoseOut():
                 self._pose = output
             case GridOut(name="grid"):
@@ -240,6 +256,7 @@ class MapMakers:
         with self._changed:
             sweeps, self._sweeps = self._sweeps, deque()
             grids, self._grids = self._grids, deque()
+            clouds, self._clouds = self._clouds, deque()
             asked, self._asked = self._asked, deque()
             redrawn, self._redrawn = self._redrawn, None
         for work, done, result in asked:
@@ -259,6 +276,10 @@ class MapMakers:
                 if source in desk.maker.sources:
                     desk.is_fed = True
                     self._guard(desk, partial(desk.maker.take_sweep, source, scan, map_from_sensor))
+            if isinstance(desk.maker, MadeOfClouds):
+                for cloud in clouds:
+                    desk.is_fed = True
+                    self._guard(desk, partial(desk.maker.take_cloud, cloud))
             if now_ns >= desk.due_ns and (desk.is_fed or desk.changed):
                 self._make(desk, now_ns)
 

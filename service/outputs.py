@@ -144,6 +144,30 @@ class DocumentOut:
     fields: Mapping[str, object]
 
 
+@dataclass(frozen=True, slots=True)
+class CloudOut:
+    """Key cloud/<mount>: the points of one nod or turn of a laser's mount, in the base frame at stamp_ns.
+
+    points_m: (N, 3).  map_from_base: where the base was, None while unknown.  sensor_m: whence ranges were measured.
+    """
+
+    mount: str
+    stamp_ns: int
+    points_m: NDArray[np.float32]
+    map_from_base: Pose2 | None
+    sensor_m: tuple[float, float, float]
+
+
 Output = (
-    ScanOut | RangesOut | PolarOut | RectOut | OdomOut | PoseOut | GridOut | GridUpdateOut | HealthOut | DocumentOut
+    CloudOut
+    | ScanOut
+    | RangesOut
+    | PolarOut
+    | RectOut
+    | OdomOut
+    | PoseOut
+    | GridOut
+    | GridUpdateOut
+    | HealthOut
+    | DocumentOut
 )

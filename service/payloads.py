@@ -23,6 +23,7 @@ from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot, SectorState
 from service import cdr, topics
 from service.export import grid_origin
 from service.outputs import (
+    CloudOut,
     DocumentOut,
     GridOut,
     GridUpdateOut,
@@ -120,6 +121,8 @@ class Encoder:
     def encode(self, output: Output, wall_offset_ns: int) -> list[Message]:
         """The messages of one output. wall_offset_ns: wall clock minus monotonic clock."""
         match output:
+            case CloudOut():
+                return [self._cloud(output, wall_offset_ns)]
             case ScanOut():
                 return [self._scan(output, wall_offset_ns)]
             case PolarOut():
@@ -165,6 +168,11 @@ class Encoder:
         scan_time_s = period_ns / _NANOS if 0 < period_ns < _LONGEST_SCAN_PERIOD_NS else 0.0
         payload = cdr.encode_laser(laser_message(out.scan, out.sensor, stamp_ns, scan_time_s))
         return Message(topics.SCAN, f"scan/{out.sensor}", payload, stamp_ns)
+
+    def _cloud(self, out: CloudOut, offset_ns: int) -> Message:
+        stamp_ns = out.stamp_ns + offset_ns
+        payload = cdr.encode_cloud(cdr.Cloud(stamp_ns, self._frames.base, out.points_m))
+        return Message(topics.CLOUD, f"cloud/{out.mount}", payload, stamp_ns)
 
     def _polar(self, out: PolarOut, offset_ns: int) -> Message:
         snap, stamp_ns = out.snapshot, out.snapshot.stamp_ns + offset_ns

@@ -6,7 +6,6 @@ import io
 import json
 import math
 import time
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from mapping.planes.extract import PlaneRules, Planes, extract_planes, range_war
 from service.cloud_files import Cloud, read_cloud
 from service.errors import Trouble, WrongUsage
 from service.files import FileTrouble, Receipt, write_whole
+from service.plane_maker import plane_entries
 
 F64 = NDArray[np.float64]
 
@@ -75,26 +75,9 @@ def range_warning_of(found: FilePlanes, rules: PlaneRules, beam_deg: float) -> s
     return range_warning(rules, math.radians(beam_deg), usual_far_m)
 
 
-def plane_documents(planes: Planes) -> list[dict[str, object]]:
-    """Each plane as umfeld.planes.v1 has it: SI units, those of most points first."""
-    return [
-        {
-            "normal": _rounded(planes.normal[k], 7),
-            "distance_m": round(float(planes.distance_m[k]), 5),
-            "centre_m": _rounded(planes.centre_m[k], 4),
-            "covariance_m2": [_rounded(row, 8) for row in planes.covariance[k]],
-            "rms_m": round(float(planes.rms_m[k]), 5),
-            "points": int(planes.count[k]),
-            "cells": int(planes.cells[k]),
-            "polygon_m": [_rounded(corner, 4) for corner in planes.polygon[k]],
-        }
-        for k in range(len(planes))
-    ]
-
-
 def json_bytes(planes: Planes, *, frame: str) -> bytes:
     """A document with a plane a line."""
-    body = ",\n".join(json.dumps(each, allow_nan=False) for each in plane_documents(planes))
+    body = ",\n".join(json.dumps(each, allow_nan=False) for each in plane_entries(planes))
     return f'{{"schema": "{SCHEMA}", "frame": {json.dumps(frame)}, "planes": [\n{body}\n]}}\n'.encode()
 
 
@@ -173,7 +156,3 @@ def _palette() -> list[tuple[int, int, int]]:
         red, green, blue = (round(255 * level * (0.25 + 0.75 * min(max(v, 0.0), 1.0))) for v in rise)
         colors.append((red, green, blue))
     return colors
-
-
-def _rounded(values: Sequence[float] | F64, digits: int) -> list[float]:
-    return [round(float(v), digits) for v in values]

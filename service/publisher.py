@@ -19,6 +19,7 @@ from typing import Any
 from service import export, topics, zenoh_session
 from service.clock import Clock
 from service.outputs import (
+    CloudOut,
     DocumentOut,
     GridOut,
     GridUpdateOut,
@@ -172,7 +173,7 @@ class Publisher:
         match output:
             case GridOut(name="grid"):
                 self._outboxes[Lane.MAP].put(slot, parcel, supersedes=topics.MAP_GRID_UPDATE.pattern)
-            case GridOut():
+            case GridOut() | CloudOut():
                 self._outboxes[Lane.MAP].put(slot, parcel)
             case DocumentOut():
                 self._outboxes[topics.topic_of(output.key).lane].put(slot, parcel)
@@ -319,6 +320,8 @@ def slot_of(output: Output) -> str:
     match output:
         case ScanOut():
             return f"scan/{output.sensor}"
+        case CloudOut():
+            return f"cloud/{output.mount}"
         case PolarOut():
             return f"sectors/polar/{output.name}"
         case RectOut():

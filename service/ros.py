@@ -32,6 +32,7 @@ _HASHES = {
     topics.GRID: "8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
     topics.GRID_UPDATE: "c4095b0be2e4363f8978a1570e0293ee093436f1e1c61d99b48502ac317025e8",
     topics.LASER_SCAN: "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
+    topics.CLOUD_TYPE: "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
     topics.RANGE: "b42b62562e93cbfe9d42b82fe5994dfa3d63d7d5c90a317981703f7388adff3a",
     topics.ODOMETRY: "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     topics.TF: "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
@@ -72,6 +73,8 @@ def ros_topic(message: Message, lasers: tuple[str, ...]) -> RosTopic | None:
         case topics.SCAN:
             name = "/scan" if lasers == (parts[1],) else f"/{_ros_name(parts[1])}/scan"
             return RosTopic(name, topics.LASER_SCAN, _SENSOR_QOS)
+        case topics.CLOUD:
+            return RosTopic(f"/{_ros_name(parts[1])}/points", topics.CLOUD_TYPE, _RELIABLE_QOS)
         case topics.RANGE_ONE:
             return RosTopic(f"/{_ros_name(parts[1])}/range_{parts[2]}", topics.RANGE, _SENSOR_QOS)
         case topics.ODOM:

@@ -9,12 +9,16 @@ from mapping.frames import Pose2
 
 @dataclass(frozen=True, slots=True)
 class Laser:
-    """A 2D laser. upside_down: mounted head down, its bearings count clockwise seen from above."""
+    """A 2D laser. upside_down: mounted head down, its bearings count clockwise seen from above.
+
+    tilts: it sits on a mount that nods or turns: its sweeps make a cloud of points, and go into no flat map.
+    """
 
     name: str
     base_from_sensor: Pose2
     height_m: float = 0.0
     upside_down: bool = False
+    tilts: bool = False
 
     kind = "laser"
 
@@ -51,4 +55,13 @@ class Wheels:
     kind = "wheels"
 
 
-Sensor = Laser | Chain | Wheels
+@dataclass(frozen=True, slots=True)
+class AxleEncoder:
+    """The encoder on the axle of a mount that nods or turns a laser."""
+
+    name: str
+
+    kind = "mount"
+
+
+Sensor = Laser | Chain | Wheels | AxleEncoder

@@ -17,6 +17,7 @@ JSON_INFO = "application/json;umfeld.info.v1"
 JSON_GRID = "application/json;umfeld.grid.v1"
 JSON_LINES = "application/json;umfeld.lines.v1"
 JSON_GRAPH = "application/json;umfeld.graph.v1"
+JSON_PLANES = "application/json;umfeld.planes.v1"
 JSON_REPLY = "application/json;umfeld.reply.v1"
 
 _CHUNK = re.compile(r"[a-z0-9_-]+\Z")
@@ -81,6 +82,7 @@ def cdr(ros_type: str) -> str:
 
 
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 RANGE = "sensor_msgs/msg/Range"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -97,6 +99,15 @@ SCAN = Topic(
     "One sweep of a laser, in the frame named like the sensor.",
     Priority.INTERACTIVE_HIGH,
     express=True,
+)
+CLOUD = Topic(
+    "cloud/<mount>",
+    CLOUD_TYPE,
+    cdr(CLOUD_TYPE),
+    "once a nod or turn",
+    "What a nodding or turning laser saw, in base_link; if configured.",
+    Priority.DATA_LOW,
+    lane=Lane.MAP,
 )
 RANGES = Topic(
     "range/<sensor>",
@@ -228,6 +239,16 @@ MAP_GRAPH = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+MAP_PLANES = Topic(
+    "map/planes",
+    "umfeld.planes.v1",
+    JSON_PLANES,
+    "at most 1 Hz, with each cloud",
+    "Planes of the newest cloud of each mount: walls, floor, table tops, with their outlines.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 HEALTH = Topic(
     "health",
     DIAGNOSTICS,
@@ -269,6 +290,7 @@ RPC = "@rpc"
 
 TOPICS: tuple[Topic, ...] = (
     SCAN,
+    CLOUD,
     RANGES,
     RANGE_ONE,
     POLAR,
@@ -283,6 +305,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_ARTOS,
     MAP_LINES,
     MAP_GRAPH,
+    MAP_PLANES,
     HEALTH,
     HEALTH_JSON,  # before health/<sensor>: the exact key wins
     HEALTH_ONE,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import pi
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -23,6 +23,7 @@ Axle = Literal["pitch", "roll", "yaw"]
 TURN = 2.0 * pi
 
 
+@runtime_checkable
 class SolidScene(Scene, Protocol):
     """A scene that knows heights."""
 

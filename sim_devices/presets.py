@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from sim_devices.encoder_vesc import STEPS_PER_ELECTRICAL_TURN, Vesc
 from sim_devices.faults import FaultPlan
 from sim_devices.laser_hokuyo import LaserProfile
 from sim_devices.lasers import FIRST_MODEL, MODELS, make_laser
+from sim_devices.mount_nodding import SolidScene, Swing, TiltedScene, angle_encoder
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.sonar_maxbotix import FAMILIES, MaxBotix, TextMultiplexer
 from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardCan, UsBoardSerial, default_parameters
@@ -44,7 +45,9 @@ SONAR_DRIVERS = ("usboard", "usboard-serial", "maxbotix", BRIDGE, MAVLINK)
 TICK_LIMITED = (BRIDGE, "roboclaw", "vesc")  # their limit of speed is max_ticks_per_s, others' max_turns_per_s
 
 HOST = "host"  # the daemon's adapter on every bus
-INLINE_TABLES = frozenset({"mount", "pose", "tls"})
+INLINE_TABLES = frozenset({"mount", "arm", "pose", "tls"})
+NODS = Swing(period_s=4.0, middle_rad=0.15, swing_rad=0.6)
+TURNS = Swing(period_s=4.0, turning=True)
 
 
 class PresetError(ValueError):
@@ -90,8 +93,8 @@ def emulate(
     folder: where the ptys' links stand.  laser: model of all lasers, whatever the configuration says; default: the
     first of each laser's driver.  profile: of a Hokuyo that is no model.  exact: no noise on lasers (recorded ranges
     have theirs).  plan: faults; its targets are laser.NAME, sonar.NAME, encoder.left and .right, bus.NAME, and
-    adapter.NAME, the daemon's port on that bus; autopilot, or autopilot.1, .2 if there are
-    several.  Raises PresetError for a device that cannot be emulated.
+    adapter.NAME, the daemon's port on that bus; mount.NAME, the encoder of a mount; autopilot, or autopilot.1, .2 if
+    there are several.  Raises PresetError for a device that cannot be emulated.
     """
     robot = Robot(copy.deepcopy(dict(config)))
     builder = _Builder(robot, scene, attachment, folder, plan or FaultPlan(seed=seed), faulty=plan is not None)
@@ -103,6 +106,8 @@ def emulate(
         builder.add_sonar(name, sonar, seed=seed + 100 + k)
     for name, wheels in robot.config.get("wheels", {}).items():
         builder.add_wheels(name, wheels)
+    for name, mount in robot.config.get("mounts", {}).items():
+        builder.add_mount(name, mount)
     for port in builder.bridge_ports():
         builder.add_bridge(port)
     ports = builder.autopilot_ports()
@@ -153,10 +158,11 @@ class _Builder:
             laser |= {"driver": MODELS[model], "mount": mount}
         target = f"laser.{name}"
         on_tcp = MODELS[model] == "sick_cola" or str(laser.get("port", "")).startswith("tcp:")
+        tilted = self._tilted(name)
         device = make_laser(
             model,
-            self._seen(target),
-            _mount(laser.get("mount", {})),
+            self._seen(target, tilted and tilted[0]),
+            tilted[1] if tilted else _mount(laser.get("mount", {})),
             seed=seed,
             number=number,
             exact=exact,
@@ -357,8 +363,48 @@ class _Builder:
         for table in tables:
             table["port"] = str(link.path)
 
-    def _seen(self, target: str) -> Scene:
-        return self.plan.scene(target, self.scene) if self.faulty else self.scene
+    def _seen(self, target: str, scene: Scene | None = None) -> Scene:
+        scene = scene or self.scene
+        return self.plan.scene(target, scene) if self.faulty else scene
+
+    # -- mounts -------------------------------------------------------------------------------------------------------
+
+    def _tilted(self, laser: str) -> tuple[Scene, Mount] | None:
+        """What a laser on a mount sees, and where the axle is; None for one that stands level."""
+        mounts: dict[str, Table] = self.robot.config.get("mounts", {})
+        name = next((name for name, table in mounts.items() if table.get("laser") == laser), None)
+        if name is None:
+            return None
+        if not isinstance(self.scene, SolidScene):
+            raise PresetError(f"mounts.{name}: what is played knows no heights; use a world")
+        table, arm = mounts[name], mounts[name].get("arm", {})
+        if any(float(arm.get(key, 0.0)) for key in ("pitch_deg", "yaw_deg")):
+            raise PresetError(f"mounts.{name}.arm: a laser can be emulated that is rolled, not pitched or yawed")
+        scene = TiltedScene(
+            self.scene,
+            _swing(table),
+            table.get("axle", "pitch"),
+            (float(arm.get("x_m", 0.0)), float(arm.get("y_m", 0.0)), float(arm.get("z_m", 0.0))),
+            math.radians(float(arm.get("roll_deg", 0.0))),
+        )
+        return scene, _mount(table.get("mount", {}))
+
+    def add_mount(self, name: str, mount: Table) -> None:
+        """The encoder on its axle; the laser on it is added like any other."""
+        _required(mount, f"mounts.{name}", ("cia406",))
+        target = f"mount.{name}"
+        counts = float(mount.get("counts_per_turn", 4096.0))
+        zero_rad = math.radians(float(mount.get("zero_deg", 0.0)))
+        swing = replace(_swing(mount), middle_rad=_swing(mount).middle_rad - zero_rad)  # the count is 0 at zero_deg
+        node = angle_encoder(
+            self._seen(target),
+            swing,
+            int(mount.get("node", 0x30)),
+            steps_per_turn=max(1, round(abs(counts))),
+            sign=1 if counts > 0 else -1,
+        )
+        self._join(_bus_of(self.robot, mount, f"mounts.{name}"), target, node)
+        self.robot.encoders[name] = node
 
     def _join(self, bus: CanBus, target: str, node: CanDevice) -> None:
         bus.add_node(target, self.plan.node(target, node) if self.faulty else node)
@@ -376,6 +422,10 @@ def _required(device: Table, place: str, drivers: Collection[str]) -> str:
     if driver not in drivers:
         raise PresetError(f"{place}.driver: {', '.join(sorted(drivers))} can be emulated here, not {driver!r}")
     return str(driver)
+
+
+def _swing(mount: Table) -> Swing:
+    return TURNS if mount.get("motion") == "turns" else NODS
 
 
 def _half_cone_rad(sonar: Table) -> float:
@@ -441,6 +491,27 @@ def artos() -> Table:
         },
         "grid": {"resolution_m": 0.05, "model": "counters"},
     }
+
+
+def nodding() -> Table:
+    """ARTOS with a second laser on a mast, which nods: clouds of points, and planes in them."""
+    table = artos()
+    table["robot"]["id"] = "nodding"
+    table["lasers"]["tilt"] = {"driver": "hokuyo", "port": "/dev/ttyACM1", "range_max_m": 30.0}
+    table["mounts"] = {
+        "mast": {
+            "driver": "cia406",
+            "can": "main",
+            "node": 0x30,
+            "laser": "tilt",
+            "axle": "pitch",
+            "motion": "nods",
+            "mount": {"x_m": 0.10, "y_m": 0.0, "z_m": 0.90, "yaw_deg": 0.0},
+            "arm": {"x_m": 0.06, "z_m": 0.04},
+            "counts_per_turn": 4096.0,
+        }
+    }
+    return table
 
 
 def _chain(base_id: int, side: float) -> Table:
@@ -543,6 +614,7 @@ def hurry(config: Table, speed: float) -> None:
 
 PRESETS: dict[str, Callable[[], Table]] = {
     "artos": artos,
+    "nodding": nodding,
     "two_wheeler": two_wheeler,
     "roboclaw": roboclaw,
     "odrive": odrive,
@@ -581,6 +653,7 @@ def for_log(
     laser.pop("range_max_m", None)
     table["lasers"] = {name: laser}
     table.pop("sonars", None)
+    table.pop("mounts", None)
     table.setdefault("drive", {})["track_width_m"] = track_width_m
     table["drive"]["max_wheel_speed_m_s"] = wheel_m_s
     for wheels in table["wheels"].values():

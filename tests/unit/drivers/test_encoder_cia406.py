@@ -13,11 +13,11 @@ import pytest
 
 from drivers.canopen_sdo import TIMED_OUT, Download, SdoClient, SdoDone, Upload
 from drivers.conversation import CanFrame
-from drivers.encoder_cia406 import Cia406PairConversation, Unwrapper
+from drivers.encoder_cia406 import Cia406AxleConversation, Cia406PairConversation, Unwrapper
 from drivers.ports import CanPort
 from drivers.queues import BoundedQueue
 from drivers.reader import WireReader
-from drivers.readings import DeviceEvent, Identity, LinkState, Reading, WheelReading
+from drivers.readings import AngleReading, DeviceEvent, Identity, LinkState, Reading, WheelReading
 
 MS = 1_000_000
 LEFT, RIGHT = 0x20, 0x21
@@ -736,3 +736,30 @@ def test_impossible_settings_are_refused(bad: dict[str, int]) -> None:
     settings: dict[str, Any] = {"node_left": LEFT, "node_right": RIGHT, **bad}
     with pytest.raises(ValueError):
         Cia406PairConversation(**settings)
+
+
+# ---- one encoder on an axle
+
+
+def test_an_axle_tells_its_absolute_angle_below_zero_and_through_turns() -> None:
+    axle = Cia406AxleConversation(LEFT)
+    node = ScriptedNode(LEFT, position=(1 << 25) - 100)
+    told: list[AngleReading] = []
+    axle.connected(0)
+    now_ns, truth = 0, -100
+    while now_ns < 3000 * MS:
+        asked = [frame for frame in axle.requests(now_ns) if isinstance(frame, CanFrame)]
+        assert not [frame for frame in asked if frame.can_id == 0x80], "it needs no SYNC, and sends none"
+        for answer in node.step(now_ns, asked):
+            told += [each for each in axle.receive(answer, now_ns) if isinstance(each, AngleReading)]
+        now_ns += MS
+        if axle.state is LinkState.RUNNING:
+            truth += 7
+            node.position = truth % (1 << 25)
+    assert len(told) > 100
+    assert told[0].ticks == -100
+    assert not told[0].continuous
+    assert all(each.continuous for each in told[1:])
+    assert told[-1].ticks > 10_000, "on past half a turn"
+    assert all(truth - each.ticks >= 0 for each in told)
+    assert abs(told[-1].ticks - truth) <= 7 * 12

@@ -109,6 +109,31 @@ def test_laser(stamp_ns: int, frame: str, n: list[float], ranges: list[float]) -
     np.testing.assert_array_equal(again.ranges, values)
 
 
+@given(stamps, frames, st.integers(0, 9), st.integers(0, 2**31))
+def test_cloud(stamp_ns: int, frame: str, count: int, seed: int) -> None:
+    points = np.random.default_rng(seed).normal(0.0, 10.0, (count, 3)).astype(np.float32)
+    ours = cdr.encode_cloud(cdr.Cloud(stamp_ns, frame, points))
+    fields = [
+        make("sensor_msgs/msg/PointField", name=axis, offset=4 * k, datatype=7, count=1) for k, axis in enumerate("xyz")
+    ]
+    message = make(
+        topics.CLOUD_TYPE,
+        header=header(stamp_ns, frame),
+        height=1,
+        width=count,
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * count,
+        data=np.frombuffer(points.tobytes(), dtype=np.uint8),
+        is_dense=True,
+    )
+    assert ours == reference(topics.CLOUD_TYPE, message)
+    again = cdr.decode_cloud(ours)
+    assert (again.stamp_ns, again.frame) == (stamp_ns, frame)
+    np.testing.assert_array_equal(again.points_m, points)
+
+
 @given(stamps, frames, st.lists(singles, min_size=4, max_size=4))
 def test_range(stamp_ns: int, frame: str, n: list[float]) -> None:
     ours = cdr.encode_range(cdr.RangeOne(stamp_ns, frame, *n))

@@ -70,9 +70,12 @@ def test_the_daemon_accepts_what_a_preset_prints(name: str, tmp_path: Path) -> N
             assert Path(bus.channel).is_symlink()
         for wheels in loaded.wheels.values():
             assert wheels.serial_port() is None or Path(wheels.serial_port() or "").is_symlink()
-        polar, rect, transducers = {"artos": (3, 1, 16), "two_wheeler": (1, 1, 2), "autopilot": (1, 1, 2)}.get(
-            name, (1, 1, 0)
-        )
+        polar, rect, transducers = {
+            "artos": (3, 1, 16),
+            "nodding": (3, 1, 16),
+            "two_wheeler": (1, 1, 2),
+            "autopilot": (1, 1, 2),
+        }.get(name, (1, 1, 0))
         assert (len(loaded.sectors.polar), len(loaded.sectors.rect)) == (polar, rect)
         assert sum(len(s.transducers) for s in loaded.sonars.values()) == transducers
     finally:

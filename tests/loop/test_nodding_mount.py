@@ -1,0 +1,93 @@
+"""A laser on a nodding mount from its wires to a client: clouds on `cloud/mast`, planes in `map/planes`."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.cdr import decode_cloud
+from service.zenoh_session import Client
+
+ROOT = Path(__file__).resolve().parents[2]
+BASE = "robots/nodding"
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(what: str, ready: Callable[[], Any], seconds: float = 60.0) -> Any:
+    deadline = time.monotonic() + seconds
+    while not (result := ready()):
+        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
+        time.sleep(0.05)
+    return result
+
+
+def floor_of(document: Any) -> list[Any]:
+    """Level planes at the height of the wheels."""
+    planes = [] if document is None else document["planes"]
+    return [each for each in planes if abs(each["normal"][2]) > 0.99 and abs(each["centre_m"][2]) < 0.03]
+
+
+def test_a_nodding_laser_shows_floor_and_walls(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    overlay = tmp_path / "umfeld.d"
+    overlay.mkdir()
+    (overlay / "test.toml").write_text(f'[network]\nlisten = ["{endpoint}"]\n[store]\nenabled = false\n')
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def start(*arguments: str) -> None:
+        with (tmp_path / f"{arguments[0]}.log").open("ab") as log:
+            processes.append(subprocess.Popen([sys.executable, "-m", *arguments], cwd=ROOT, stdout=log, stderr=log))
+
+    try:
+        start("sim_devices", "--preset", "nodding", "--dir", str(tmp_path))
+        wait_for("the devices", lambda: (tmp_path / "umfeld.toml").exists() and (tmp_path / "laser-tilt").exists())
+        start("service", "run", "--config", str(tmp_path / "umfeld.toml"))
+
+        def connected() -> Client | None:
+            try:
+                client = Client(endpoint)
+            except Exception:
+                return None
+            if client.bases() == [BASE]:
+                return client
+            client.close()
+            return None
+
+        with wait_for("the daemon", connected) as client:
+
+            def planes() -> Any:
+                found = client.get(f"{BASE}/map/planes")
+                return json.loads(found[0].payload) if found else None
+
+            document = wait_for(
+                "planes with the floor among them", lambda: each if floor_of(each := planes()) else None
+            )
+            cloud = decode_cloud(wait_for("a cloud", lambda: client.get(f"{BASE}/cloud/mast"))[0].payload)
+            health = json.loads(client.get(f"{BASE}/health/json")[0].payload)
+        assert document["schema"] == "umfeld.planes.v1"
+        assert {plane["mount"] for plane in document["planes"]} == {"mast"}
+        upright = [plane for plane in document["planes"] if abs(plane["normal"][2]) < 0.03]
+        assert len(upright) >= 2, "walls stand upright"
+        assert cloud.frame == "base_link"
+        assert len(cloud.points_m) > 20_000
+        assert 0.02 < np.mean(np.abs(cloud.points_m[:, 2]) < 0.05) < 0.95
+        assert {each["name"] for each in health["sources"]} >= {"front", "tilt", "mast"}
+    finally:
+        for process in processes[::-1]:
+            process.send_signal(signal.SIGTERM)
+        for process in processes:
+            process.wait(20)

@@ -1,0 +1,190 @@
+"""Tilting lasers in the daemon without its wires: configuration, fusion, planes."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.readings import AngleReading, DeviceEvent, LinkState, ScanReading, WheelReading
+from mapping.frames import Pose2
+from service import assemble
+from service.config import Config, load
+from service.errors import WrongUsage
+from service.fusion import Fusion, OdometryOnly
+from service.map_makers import MapMakers
+from service.outputs import CloudOut, DocumentOut, Output, PolarOut, ScanOut
+from service.payloads import document_message
+from service.plane_maker import PlaneMaker
+
+F64 = NDArray[np.float64]
+MS = 1_000_000
+BEARING = np.radians(np.arange(-60.0, 60.1, 0.5))
+TEXT = """
+[can.main]
+interface = "virtual"
+[lasers.front]
+driver = "hokuyo"
+port = "/dev/a"
+[lasers.tilt]
+driver = "hokuyo"
+port = "/dev/b"
+[mounts.mast]
+driver = "cia406"
+can = "main"
+laser = "tilt"
+counts_per_turn = -3600.0
+zero_deg = 5.0
+mount = { z_m = 1.0 }
+arm = { x_m = 0.05, z_m = 0.02 }
+[sectors.polar.around]
+sources = ["front"]
+"""
+
+
+def config_of(tmp_path: Path, text: str = TEXT) -> Config:
+    path = tmp_path / "umfeld.toml"
+    path.write_text(text)
+    return load(path, environment={}).config
+
+
+def fusion_of(config: Config) -> Fusion:
+    found = assemble.sensors(config)
+    return Fusion(assemble.parts(config, found, assemble.maps(config, found), OdometryOnly()))
+
+
+def angle_at(stamp_ns: int) -> float:
+    return 0.3 + 0.5 * math.sin(2.0 * math.pi * stamp_ns / 2e9)
+
+
+def sweep_of_floor_and_wall(stamp_ns: int, config: Config) -> ScanReading:
+    """Ranges to the floor z = 0 and the wall x = 4, each beam at its own moment."""
+    mount = assemble.tilting_lasers(config)[0].settings.mount
+    stamps = stamp_ns + np.arange(len(BEARING)) * 50_000
+    origin, way = mount.rays(BEARING, np.array([angle_at(int(s)) for s in stamps]))
+    with np.errstate(divide="ignore"):
+        floor = np.where(way[:, 2] < 0.0, -origin[:, 2] / way[:, 2], np.inf)
+        wall = np.where(way[:, 0] > 0.0, (4.0 - origin[:, 0]) / way[:, 0], np.inf)
+    ranges = np.minimum(floor, wall)
+    ranges[ranges > 20.0] = np.inf
+    return ScanReading(stamp_ns, 50_000.0, 25 * MS, BEARING, ranges, 0.05, 30.0)
+
+
+def nod(fusion: Fusion, config: Config, *, until_ms: int = 2600, lost_ms: range = range(0)) -> list[Output]:
+    outputs: list[Output] = []
+    for ms in range(0, until_ms, 5):
+        now_ns = ms * MS
+        if ms not in lost_ms:
+            ticks = round((math.degrees(angle_at(now_ns)) - 5.0) * -10.0)
+            outputs += fusion.on_item("mast", AngleReading(now_ns, ticks, ms > 0), now_ns)
+        if ms % 25 == 0 and ms > 0:
+            stamp_ns = now_ns - 20 * MS
+            outputs += fusion.on_item("tilt", sweep_of_floor_and_wall(stamp_ns, config), now_ns)
+            outputs += fusion.tick(now_ns)
+    return outputs
+
+
+def test_sweeps_of_a_nodding_laser_become_clouds_and_nothing_else(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    fusion = fusion_of(config)
+    outputs = nod(fusion, config)
+    clouds = [each for each in outputs if isinstance(each, CloudOut)]
+    assert len(clouds) == 2
+    for cloud in clouds:
+        assert cloud.mount == "mast"
+        assert cloud.map_from_base == Pose2()
+        off = np.minimum(np.abs(cloud.points_m[:, 2]), np.abs(cloud.points_m[:, 0] - 4.0))
+        assert off.max() < 0.02  # a count is a tenth of a degree: 4 mm at 4 m, along a flat floor more
+        assert np.median(off) < 0.002
+    assert not [each for each in outputs if isinstance(each, ScanOut)]
+    assert all("obstacle" not in str(each.snapshot.state) for each in outputs if isinstance(each, PolarOut))
+    assert fusion.drops.get("mast", {}) == {}
+
+
+def test_without_angles_nothing_is_placed_and_all_is_counted(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    fusion = fusion_of(config)
+    lost = range(400, 1000)
+    clouds = [each for each in nod(fusion, config, lost_ms=lost) if isinstance(each, CloudOut)]
+    drops = fusion.drops["mast"]
+    assert drops["angle_gone"] + drops.get("angle_late", 0) == pytest.approx(600 / 25, abs=2)
+    assert all(np.minimum(np.abs(c.points_m[:, 2]), np.abs(c.points_m[:, 0] - 4.0)).max() < 0.02 for c in clouds), (
+        "no beam was put at an angle that was not measured"
+    )
+    fusion.on_item("mast", DeviceEvent(2600 * MS, LinkState.SILENT, ""), 2600 * MS)
+    fusion.on_item("tilt", sweep_of_floor_and_wall(2590 * MS, config), 2610 * MS)
+    fusion.tick(3200 * MS)
+    assert fusion.drops["mast"]["angle_late"] >= 1
+
+
+def test_the_vehicles_motion_is_taken_out(tmp_path: Path) -> None:
+    wheels = '[drive]\nsource = "drive"\n[wheels.drive]\ndriver = "roboclaw"\nport = "/dev/c"\n'
+    config = config_of(tmp_path, TEXT + wheels)
+    fusion = fusion_of(config)
+    fusion.on_item("tilt", sweep_of_floor_and_wall(0, config), 20 * MS)
+    for ms in range(0, 100, 5):
+        fusion.on_item("mast", AngleReading(ms * MS, 0, ms > 0), ms * MS)
+    fusion.tick(200 * MS)
+    assert "mast" not in fusion.drops, "it waits for odometry"
+    fusion.tick(700 * MS)
+    assert fusion.drops["mast"] == {"odometry_late": 1}
+    fusion.on_item("drive", WheelReading(710 * MS, 0, 0, False), 710 * MS)
+
+
+def test_planes_of_a_cloud_in_the_map() -> None:
+    random = np.random.default_rng(1)
+    u, v = random.uniform(-1.0, 1.0, (2, 4000))
+    floor = np.column_stack((2.0 + u, v, np.zeros(4000)))
+    wall = np.column_stack((np.full(4000, 3.0), v, 1.0 + u))
+    points = (np.concatenate((floor, wall)) + random.normal(0.0, 0.004, (8000, 3))).astype(np.float32)
+    told: list[Output] = []
+    makers = MapMakers([PlaneMaker()], told.append, now_ns=lambda: 0)
+    makers.take_output(CloudOut("mast", 5 * MS, points, Pose2(1.0, 2.0, math.pi / 2.0), (0.0, 0.0, 1.0)))
+    makers.turn(10 * MS)
+    (document,) = told
+    assert isinstance(document, DocumentOut)
+    assert document.key == "map/planes"
+    message = json.loads(document_message(document, 0).payload)
+    assert message["version"] == 1
+    planes = sorted(message["planes"], key=lambda plane: abs(plane["normal"][2]))
+    np.testing.assert_allclose(planes[0]["normal"], (0.0, 1.0, 0.0), atol=0.005)
+    assert planes[0]["distance_m"] == pytest.approx(5.0, abs=0.005)
+    assert abs(planes[1]["normal"][2]) > 0.999
+    assert planes[1]["distance_m"] < 0.01
+    makers.take_output(CloudOut("mast", 6 * MS, points, None, (0.0, 0.0, 1.0)))
+    makers.turn(3000 * MS)
+    assert len(told) == 1, "where it was is not known: nothing is told"
+    for k in range(9):
+        makers.take_output(CloudOut("mast", k * MS, points[:10], None, (0.0, 0.0, 1.0)))
+    assert makers.counters()["makers.clouds_lost"] == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (TEXT.replace('laser = "tilt"', 'laser = "none"'), "there is no [lasers.none]"),
+        (TEXT.replace('sources = ["front"]', 'sources = ["front", "tilt"]'), "tilted by mounts.mast"),
+        (TEXT.replace("-3600.0", "0.0"), "cannot be 0"),
+        (TEXT.replace('can = "main"', 'can = "other"'), "there is no [can.other]"),
+        (TEXT + '[mounts.two]\ndriver = "cia406"\ncan = "main"\nnode = 49\nlaser = "tilt"\n', "already"),
+        (TEXT + '[mounts.two]\ndriver = "cia406"\ncan = "main"\nlaser = "front"\n', "CAN id"),
+        (TEXT.replace("zero_deg", "zero_rad"), "zero_deg"),
+    ],
+)
+def test_faults_of_a_mount_name_their_repair(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(WrongUsage) as caught:
+        config_of(tmp_path, text)
+    assert says in str(caught.value)
+
+
+def test_a_tilted_laser_feeds_no_flat_map(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    found = assemble.sensors(config)
+    maps = assemble.maps(config, found)
+    assert all("tilt" not in grid.sources for grid in maps.grids)
+    assert all("tilt" not in maker.sources for maker in assemble.map_makers(config, found))
+    assert "planes" in {maker.name for maker in assemble.map_makers(config, found)}
