@@ -32,6 +32,7 @@ COMMANDS: dict[str, str] = {
     "record": "Record raw bytes and everything published.",
     "replay": "Play a recording through the real drivers.",
     "extract": "One algorithm on one file: lines, planes, features, regions, Voronoi.",
+    "localise": "Where a recorded log's robot was in a known map, and how sure.",
     "evaluate": "The relation error of a trajectory.",
     "calibrate": "Wheel radii, track width and sensor poses from a log.",
     "bench": "Our kernels on this machine.",
