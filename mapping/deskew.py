@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.frames import Pose2, wrap_angles
+from mapping.frames import Pose2
+from mapping.kernels import motion as kernels
 from mapping.pose_buffer import PoseBuffer
 from mapping.scan import Scan
 
@@ -52,27 +53,11 @@ def deskew(scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> D
     if not len(stamps) or scan.beam_period_ns == 0.0:
         at_once = Scan(reference_ns, 0.0, scan.bearing_rad, scan.range_m, scan.range_min_m, scan.range_max_m)
         return Deskewed(at_once, reference, np.zeros((len(stamps), 2)), 0.0)
-    origin, turn = _sensor_motion(odom_from_base.at_many(stamps), base_from_sensor, reference)
-    bearing = scan.bearing_rad + turn
-    hit = np.isfinite(scan.range_m)
-    reach = np.where(hit, scan.range_m, 0.0)
-    x, y = origin[:, 0] + reach * np.cos(bearing), origin[:, 1] + reach * np.sin(bearing)
-    moved = Scan(
-        reference_ns,
-        0.0,
-        np.where(hit, np.arctan2(y, x), wrap_angles(bearing)),
-        np.where(hit, np.hypot(x, y), scan.range_m),
-        scan.range_min_m,
-        scan.range_max_m,
+    sensor = kernels.carried(
+        odom_from_base.at_many(stamps), base_from_sensor.x_m, base_from_sensor.y_m, base_from_sensor.yaw_rad
     )
+    bearing, distance, origin = kernels.seen_at_once(
+        sensor, reference.x_m, reference.y_m, reference.yaw_rad, scan.bearing_rad, scan.range_m
+    )
+    moved = Scan(reference_ns, 0.0, bearing, distance, scan.range_min_m, scan.range_max_m)
     return Deskewed(moved, reference, origin, float(np.hypot(origin[:, 0], origin[:, 1]).max()))
-
-
-def _sensor_motion(odom_from_base: F64, base_from_sensor: Pose2, odom_from_reference: Pose2) -> tuple[F64, F64]:
-    """Sensor origins (N, 2) and turns (N,) in the reference frame, from base poses (N, 3)."""
-    cos, sin = np.cos(odom_from_base[:, 2]), np.sin(odom_from_base[:, 2])
-    x = odom_from_base[:, 0] + cos * base_from_sensor.x_m - sin * base_from_sensor.y_m
-    y = odom_from_base[:, 1] + sin * base_from_sensor.x_m + cos * base_from_sensor.y_m
-    yaw = odom_from_base[:, 2] + base_from_sensor.yaw_rad
-    origin = odom_from_reference.inverse().apply(np.stack((x, y), axis=-1))
-    return origin, wrap_angles(yaw - odom_from_reference.yaw_rad)

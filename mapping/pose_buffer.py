@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mapping.frames import Pose2, wrap_angles
+from mapping.frames import Pose2
+from mapping.kernels import motion as kernels
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -92,70 +91,10 @@ class PoseBuffer:
             raise NotYetError("no pose that new is known yet")
         if len(asked) and asked.min() < stamps[0]:
             raise GoneError("no pose that old is kept")
-        after = np.clip(np.searchsorted(stamps, asked, side="left"), 1, max(len(stamps) - 1, 1))
         if len(stamps) == 1:
             return np.repeat(self._pose[self._begin : self._end], len(asked), axis=0)
-        exact = stamps[after - 1] == asked
-        stretch = self._stretch[self._begin : self._end]
-        if np.any((stretch[after] != stretch[after - 1]) & ~exact & (stamps[after] != asked)):
+        found = np.empty((len(asked), 3))
+        kept = slice(self._begin, self._end)
+        if not kernels.poses_at(np.ascontiguousarray(asked), stamps, self._pose[kept], self._stretch[kept], found):
             raise GoneError("the track is broken at that time")
-        pose = self._pose[self._begin : self._end]
-        span = (stamps[after] - stamps[after - 1]).astype(np.float64)
-        share = (asked - stamps[after - 1]) / span
-        first, last = (int(after.min()), int(after.max())) if len(after) else (1, 1)
-        if last - first >= len(asked):
-            return interpolate_many(pose[after - 1], pose[after], share)
-        # A sweep crosses few arcs: what belongs to an arc is worked out once, not for every beam on it.
-        arcs = _Arcs.between(pose[first - 1 : last], pose[first : last + 1])
-        return arcs.of(after - first).at(share)
-
-
-def interpolate_many(start: F64, end: F64, share: F64) -> F64:
-    """Poses (N, 3) at shares (N,) of the way along arcs from start (N, 3) to end (N, 3); as frames.interpolate."""
-    return _Arcs.between(start, end).at(share)
-
-
-@dataclass(frozen=True, slots=True)
-class _Arcs:
-    """Motions of constant twist: start (N, 3), cosine and sine of its yaw, velocity in its frame, turn; (N,) each."""
-
-    start: F64
-    cos: F64
-    sin: F64
-    vx: F64
-    vy: F64
-    turn: F64
-
-    @staticmethod
-    def between(start: F64, end: F64) -> _Arcs:
-        turn = wrap_angles(end[:, 2] - start[:, 2])
-        a, b = _arc_coefficients(turn)
-        cos, sin = np.cos(start[:, 2]), np.sin(start[:, 2])
-        dx, dy = end[:, 0] - start[:, 0], end[:, 1] - start[:, 1]
-        x, y = cos * dx + sin * dy, cos * dy - sin * dx  # the motion in the start's frame
-        norm = a * a + b * b
-        return _Arcs(start, cos, sin, (a * x + b * y) / norm, (a * y - b * x) / norm, turn)
-
-    def of(self, which: NDArray[np.int64]) -> _Arcs:
-        """Those arcs, in that order."""
-        return _Arcs(
-            self.start[which], self.cos[which], self.sin[which], self.vx[which], self.vy[which], self.turn[which]
-        )
-
-    def at(self, share: F64) -> F64:
-        """Poses (N, 3) at shares of the way."""
-        a, b = _arc_coefficients(share * self.turn)
-        x, y = share * (a * self.vx - b * self.vy), share * (b * self.vx + a * self.vy)
-        poses = np.empty((len(share), 3))
-        poses[:, 0] = self.start[:, 0] + self.cos * x - self.sin * y
-        poses[:, 1] = self.start[:, 1] + self.sin * x + self.cos * y
-        poses[:, 2] = wrap_angles(self.start[:, 2] + share * self.turn)
-        return poses
-
-
-def _arc_coefficients(w: F64) -> tuple[F64, F64]:
-    small = np.abs(w) < 1e-6
-    safe = np.where(small, 1.0, w)
-    return np.where(small, 1.0 - w * w / 6.0, np.sin(safe) / safe), np.where(
-        small, w / 2.0, (1.0 - np.cos(safe)) / safe
-    )
+        return found

@@ -40,6 +40,7 @@ from drivers.readings import (
 )
 from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
+from mapping.kernels import motion
 from mapping.odometry import DifferentialOdometry, DriveGeometry, OdometryState
 from mapping.pose_buffer import GoneError, PoseBuffer
 from mapping.scan import Scan
@@ -743,15 +744,8 @@ def compose_many(a_from_b: Pose2, b_from_c: F64) -> F64:
 
 def carry(a_from_b: F64, b_from_c: Pose2) -> F64:
     """a_from_c (N, 3) of many poses and one."""
-    c, s = np.cos(a_from_b[:, 2]), np.sin(a_from_b[:, 2])
-    return np.stack(
-        (
-            a_from_b[:, 0] + c * b_from_c.x_m - s * b_from_c.y_m,
-            a_from_b[:, 1] + s * b_from_c.x_m + c * b_from_c.y_m,
-            a_from_b[:, 2] + b_from_c.yaw_rad,
-        ),
-        axis=-1,
-    )
+    moved: F64 = motion.carried(np.ascontiguousarray(a_from_b), b_from_c.x_m, b_from_c.y_m, b_from_c.yaw_rad)
+    return moved
 
 
 def stale_after_ns(period_ns: int, sweep_ns: int) -> int:

@@ -16,6 +16,7 @@ from numba import njit
 
 TWO_PI = 2.0 * math.pi
 EDGE_RAD = 1e-9  # bearings closer to an edge than this lie on it
+CLEAR_RAD = 1e-7  # bearings farther from an edge than this are surely on its one side
 TOUCH_M = 1e-9  # a shorter stretch is a touch
 MAX_CUTS = 64  # of one segment with the outline of the vehicle
 
@@ -159,6 +160,140 @@ def clip_to_wedge(
 
 
 @njit(cache=True, nogil=True)
+def gaps_between(bearing: Any) -> Any:
+    """(N - 1,) angles between neighbouring bearings, at most half a turn each."""
+    gaps = np.empty(len(bearing) - 1)
+    for k in range(len(gaps)):
+        gaps[k] = abs((bearing[k + 1] - bearing[k] + math.pi) % TWO_PI - math.pi)
+    return gaps
+
+
+@njit(cache=True, nogil=True)
+def thin_sectors(bearing: Any, distance: Any, range_max: float, gap_max: float, spacing: float) -> tuple[Any, Any, Any]:
+    """The thin sector of every beam and how long it is: lo, hi, length (N,) each.
+
+    bearing: (N,) ascending within one turn.  Neighbours no farther apart than gap_max meet half-way, others leave half
+    a spacing.  length: range_max for a beam that saw nothing, 0 where nothing is proved free, NaN of an invalid beam.
+    """
+    count = len(bearing)
+    lo, hi, length = np.empty(count), np.empty(count), np.empty(count)
+    for k in range(count):
+        gap = bearing[k + 1] - bearing[k] if k + 1 < count else bearing[0] + TWO_PI - bearing[k]
+        reach = 0.5 * gap if gap <= gap_max else 0.5 * spacing
+        hi[k] = bearing[k] + reach
+        lo[k + 1 if k + 1 < count else 0] = bearing[k + 1 if k + 1 < count else 0] - reach
+        r = distance[k]
+        if r == math.inf:
+            length[k] = range_max if range_max < math.inf else 0.0
+        elif r > 0.0:
+            length[k] = r if r <= range_max else 0.0
+        else:  # too close, zero; a negative number is no range
+            length[k] = 0.0 if r == 0.0 or r == -math.inf else math.nan
+    return lo, hi, length
+
+
+@njit(cache=True, nogil=True)
+def in_star(points: Any, x: float, y: float, yaw: float, lo: Any, hi: Any, length: Any, anywhere: bool) -> Any:
+    """(N,) which of (N, 2) points lie in a star about the sensor at x, y, yaw: within the chord of a thin sector.
+
+    lo, hi, length: (M,) ascending, apart.  anywhere: in the direction of a thin sector, at any distance.
+    """
+    count = len(lo)
+    inside = np.zeros(len(points), dtype=np.bool_)
+    if count == 0:
+        return inside
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    first = lo[0] - EDGE_RAD
+    for k in range(len(points)):
+        dx, dy = points[k, 0] - x, points[k, 1] - y
+        px, py = cos * dx + sin * dy, cos * dy - sin * dx
+        along = (math.atan2(py, px) - first) % TWO_PI + first
+        at = max(np.searchsorted(lo, along + EDGE_RAD, side="right") - 1, 0)
+        if along > hi[at] + EDGE_RAD:
+            continue
+        inside[k] = anywhere or math.hypot(px, py) <= length[at] * math.cos(0.5 * (hi[at] - lo[at]))
+    return inside
+
+
+@njit(cache=True, nogil=True)
+def beam_ends(bearing: Any, distance: Any, range_min: float, least: float, x: float, y: float, yaw: float) -> Any:
+    """(M, 2) obstacles that a fan of beams met, of a sensor that stands at x, y, yaw; too close: at range_min."""
+    points = np.empty((len(bearing), 2))
+    count = 0
+    for k in range(len(bearing)):
+        r = range_min if distance[k] == -math.inf else distance[k]
+        if not 0.0 <= r < math.inf and distance[k] != -math.inf:
+            continue
+        r = max(r, least)
+        angle = bearing[k] + yaw
+        points[count, 0], points[count, 1] = x + r * math.cos(angle), y + r * math.sin(angle)
+        count += 1
+    return points[:count]
+
+
+@njit(cache=True, nogil=True)
+def judge(
+    obstacle: Any, u: Any, v: Any, free: Any, blind: Any, stamp: Any, fresh: Any, source: Any, all_heard: bool,
+    now_ns: int, states: Any,
+) -> tuple[Any, Any, Any, Any, Any, Any]:  # fmt: skip
+    """What the findings (F, N) of all channels come to for each of N sectors; the rules: mapping/sectors/evidence.py.
+
+    stamp, fresh: (F, N).  source: (F,).  states: values of OBSTACLE, FREE, UNKNOWN, STALE.  Returns (N,) state,
+    distance, u, v, age and source as in Verdict. Of equals the first finding counts.
+    """
+    rows, count = obstacle.shape
+    is_obstacle, is_free, is_unknown, is_stale = states
+    state = np.full(count, is_unknown, dtype=np.int8)
+    distance, at_u, at_v = np.full(count, math.nan), np.full(count, math.nan), np.full(count, math.nan)
+    age, of = np.full(count, -1, dtype=np.int64), np.full(count, -1, dtype=np.int16)
+    for sector in range(count):
+        nearest, seen, old, any_near = math.inf, 0.0, math.inf, math.inf
+        at_nearest, at_seen, at_old, at_any = 0, 0, 0, 0
+        is_blind = False
+        for row in range(rows):
+            met, through = obstacle[row, sector], free[row, sector]
+            if met < any_near:
+                any_near, at_any = met, row
+            if fresh[row, sector]:
+                is_blind = is_blind or blind[row, sector]
+                if met < nearest:
+                    nearest, at_nearest = met, row
+                if through > seen:
+                    seen, at_seen = through, row
+            else:
+                knew = met if met < math.inf else (through if through > 0.0 else math.inf)
+                if knew < old:
+                    old, at_old = knew, row
+        shown, decides = math.inf, -1
+        at = at_nearest
+        if old < nearest * (1.0 - 1e-12):
+            state[sector], shown, at, decides = is_stale, any_near, at_any, at_old
+        elif nearest < math.inf:
+            state[sector], shown, decides = is_obstacle, nearest, at_nearest
+        elif seen > 0.0 and not is_blind and all_heard:
+            state[sector], decides = is_free, at_seen
+            distance[sector] = seen
+        if decides < 0:
+            continue
+        if shown < math.inf:
+            distance[sector], at_u[sector], at_v[sector] = shown, u[at, sector], v[at, sector]
+        age[sector] = max(now_ns - stamp[decides, sector], 0)
+        of[sector] = source[decides]
+    return state, distance, at_u, at_v, age, of
+
+
+@njit(cache=True, nogil=True)
+def well_within(
+    bearing: float, x: float, y: float, start: float, width: float, count: int, edge_x: Any, edge_y: Any
+) -> int:
+    """The sector that a point at this bearing lies well inside, -1 if that is not sure."""
+    if width > 3.0:
+        return -1
+    sector = int((bearing - start) % TWO_PI / width)
+    return sector if sector < count and well_inside(x, y, sector, edge_x, edge_y) else -1
+
+
+@njit(cache=True, nogil=True)
 def star_border(lo: Any, hi: Any, length: Any, x: float, y: float, yaw: float) -> Any:
     """(M, 2) corners of the union of thin sectors about (x, y), ascending and apart, with chords for arcs.
 
@@ -166,16 +301,27 @@ def star_border(lo: Any, hi: Any, length: Any, x: float, y: float, yaw: float) -
     """
     corners = np.empty((3 * len(lo), 2))
     count = 0
+    last, ux, uy = math.nan, 0.0, 0.0
     for k in range(len(lo)):
-        for angle in (lo[k], hi[k]):
-            corners[count, 0] = x + length[k] * math.cos(angle + yaw)
-            corners[count, 1] = y + length[k] * math.sin(angle + yaw)
-            count += 1
+        if lo[k] != last:  # else neighbours meet
+            ux, uy = math.cos(lo[k] + yaw), math.sin(lo[k] + yaw)
+        corners[count, 0], corners[count, 1] = x + length[k] * ux, y + length[k] * uy
+        last = hi[k]
+        ux, uy = math.cos(last + yaw), math.sin(last + yaw)
+        corners[count + 1, 0], corners[count + 1, 1] = x + length[k] * ux, y + length[k] * uy
+        count += 2
         following = lo[k + 1] if k + 1 < len(lo) else lo[0] + TWO_PI
         if following - hi[k] > EDGE_RAD:
             corners[count, 0], corners[count, 1] = x, y
             count += 1
     return corners[:count]
+
+
+@njit(cache=True, nogil=True)
+def well_inside(x: float, y: float, sector: int, edge_x: Any, edge_y: Any) -> bool:
+    """Whether a point lies in a sector narrower than half a turn and nowhere near its edges."""
+    slack = CLEAR_RAD * (abs(x) + abs(y))
+    return edge_x[sector] * y - edge_y[sector] * x > slack and edge_y[sector + 1] * x - edge_x[sector + 1] * y > slack
 
 
 @njit(cache=True, nogil=True)
@@ -193,15 +339,19 @@ def free_reach(border: Any, edges: Any, width: float, polygon: Any, reach: float
         free[:] = 0.0
         return free
     bx, by = border[corners - 1, 0], border[corners - 1, 1]
-    b_rad = math.atan2(by, bx)
+    here = -1  # the sector that a lies well inside, if it is known
     for corner in range(corners):
-        ax, ay, a_rad = bx, by, b_rad
+        ax, ay = bx, by
         bx, by = border[corner, 0], border[corner, 1]
         if ax == bx and ay == by:
             continue
-        b_rad = math.atan2(by, bx)
         nx, ny = nearest_on(ax, ay, bx, by)
         near = math.hypot(nx, ny)
+        if here >= 0 and near > reach and well_inside(bx, by, here, edge_x, edge_y):
+            free[here] = min(free[here], near)  # all of it lies in this sector, outside the vehicle
+            continue
+        a_rad, b_rad = math.atan2(ay, ax), math.atan2(by, bx)
+        here = well_within(b_rad, bx, by, start, width, count, edge_x, edge_y)
         if near >= range_max:
             continue
         turn = (b_rad - a_rad + math.pi) % TWO_PI - math.pi
@@ -270,15 +420,24 @@ def nearest_in_sectors(x: Any, y: Any, edges: Any, width: float, range_max: floa
     start, span = edges[0], edges[-1] - edges[0]
     best = np.full(count, math.inf)
     at = np.full(count, math.nan)
+    edge_x, edge_y = np.cos(edges), np.sin(edges)
+    found = np.full(count, -1, dtype=np.int64)
+    here = -1
     for k in range(len(x)):
         distance = math.hypot(x[k], y[k])
         if not distance <= range_max:
             continue
-        bearing = math.atan2(y[k], x[k])
-        sector = sector_of(bearing, start, width, span, count)
+        sector = here
+        if here < 0 or not well_inside(x[k], y[k], here, edge_x, edge_y):
+            bearing = math.atan2(y[k], x[k])
+            sector = sector_of(bearing, start, width, span, count)
+            here = well_within(bearing, x[k], y[k], start, width, count, edge_x, edge_y)
         if sector >= 0 and distance < best[sector]:
             best[sector] = distance
-            at[sector] = bearing
+            found[sector] = k
+    for sector in range(count):
+        if found[sector] >= 0:
+            at[sector] = math.atan2(y[found[sector]], x[found[sector]])
     return best, at
 
 

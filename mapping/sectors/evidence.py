@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.kernels import sectors as kernels
 from mapping.sectors.snapshot import SectorState
 
 F64 = NDArray[np.float64]
@@ -27,6 +28,7 @@ I8 = NDArray[np.int8]
 Bool = NDArray[np.bool_]
 Looked = Callable[[F64, F64, F64], Bool]
 """Of obstacles, given by distance and two coordinates, (N,) each: in whose direction did the new reading look?"""
+_STATES = tuple(int(each) for each in (SectorState.OBSTACLE, SectorState.FREE, SectorState.UNKNOWN, SectorState.STALE))
 
 
 @dataclass(slots=True)
@@ -163,40 +165,8 @@ class Evidence:
 
     def _judge(self, now_ns: int) -> Verdict:
         obstacle, u, v, free, stamp, fresh, source, blind = self._table(now_ns)
-        sector = np.arange(self._count)
-        nearest = np.where(fresh, obstacle, np.inf)
-        at_nearest = nearest.argmin(axis=0)
-        nearest_m = nearest[at_nearest, sector]
-        seen = np.where(fresh, free, 0.0)
-        at_seen = seen.argmax(axis=0)
-        seen_m = seen[at_seen, sector]
-        known = np.isfinite(obstacle) | (free > 0.0)
-        old = np.where(~fresh & known, np.where(np.isfinite(obstacle), obstacle, free), np.inf)
-        at_old = old.argmin(axis=0)
-        old_m = old[at_old, sector]
-
-        state = np.full(self._count, SectorState.UNKNOWN, dtype=np.int8)
-        may_be_free = (seen_m > 0.0) & ~(blind & fresh).any(axis=0) & all(self._heard)
-        state[may_be_free] = SectorState.FREE
-        state[np.isfinite(nearest_m)] = SectorState.OBSTACLE
-        state[old_m < nearest_m * (1.0 - 1e-12)] = SectorState.STALE
-        is_stale, is_free = state == SectorState.STALE, state == SectorState.FREE
-
-        # The obstacle to show: of the fresh ones, or of all once the sector is stale.
-        at_any = obstacle.argmin(axis=0)
-        at = np.where(is_stale, at_any, at_nearest)
-        shown = obstacle[at, sector]
-        has_point = (is_stale | (state == SectorState.OBSTACLE)) & np.isfinite(shown)
-        distance = np.where(has_point, shown, np.where(is_free, seen_m, np.nan))
-        decides = np.where(is_stale, at_old, np.where(is_free, at_seen, at_nearest))
-        is_known = state != SectorState.UNKNOWN
         return Verdict(
-            state,
-            distance,
-            np.where(has_point, u[at, sector], np.nan),
-            np.where(has_point, v[at, sector], np.nan),
-            np.where(is_known, np.maximum(now_ns - stamp[decides, sector], 0), -1).astype(np.int64),
-            np.where(is_known, source[decides], -1).astype(np.int16),
+            *kernels.judge(obstacle, u, v, free, blind, stamp, fresh, source, all(self._heard), now_ns, _STATES)
         )
 
     def _table(self, now_ns: int) -> tuple[F64, F64, F64, F64, I64, Bool, I64, Bool]:

@@ -22,7 +22,6 @@ Bool = NDArray[np.bool_]
 
 GAP_MAX_SPACINGS = 1.5
 TURN = 2.0 * math.pi
-_TOUCH_RAD = kernels.EDGE_RAD
 _SAME_PLACE_M = 1e-9
 _CONE_STEP_RAD = math.radians(2.0)
 _ARC_STEP_RAD = math.radians(0.5)
@@ -61,31 +60,29 @@ class Sight:
 
     def contains(self, points: F64) -> Bool:
         """(N,) which (N, 2) points, virtual sensor frame, were seen to be free."""
-        seen, at, distance = self._beam_at(points, self.lo_rad, self.hi_rad)
-        if not seen.any():
-            return seen
-        inner = self.length_m * np.cos(0.5 * (self.hi_rad - self.lo_rad))
-        return np.asarray(seen & (distance <= inner[at]))
+        return self._in_star(points, self.lo_rad, self.hi_rad, anywhere=False)
 
     def looked_at(self, points: F64) -> Bool:
         """(N,) in which directions of (N, 2) points a valid beam looked, whatever it saw there."""
-        return self._beam_at(points, self.looked_lo_rad, self.looked_hi_rad)[0]
+        return self._in_star(points, self.looked_lo_rad, self.looked_hi_rad, anywhere=True)
 
-    def _beam_at(self, points: F64, lo_rad: F64, hi_rad: F64) -> tuple[Bool, NDArray[np.int64], F64]:
-        own = self.virtual_from_sensor.inverse().apply(points)
-        distance = np.hypot(own[:, 0], own[:, 1])
-        if len(lo_rad) == 0:
-            return np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=np.int64), distance
-        along = (np.arctan2(own[:, 1], own[:, 0]) - lo_rad[0] + _TOUCH_RAD) % TURN + lo_rad[0] - _TOUCH_RAD
-        at = np.maximum(np.searchsorted(lo_rad, along + _TOUCH_RAD, side="right") - 1, 0)
-        return np.asarray(along <= hi_rad[at] + _TOUCH_RAD), at, distance
+    def _in_star(self, points: F64, lo_rad: F64, hi_rad: F64, *, anywhere: bool) -> Bool:
+        pose = self.virtual_from_sensor
+        inside: Bool = kernels.in_star(
+            np.ascontiguousarray(points), pose.x_m, pose.y_m, pose.yaw_rad, lo_rad, hi_rad, self.length_m, anywhere
+        )
+        return inside
 
 
 def median_spacing(bearing_rad: F64) -> float | None:
     """The usual angle between neighbouring beams; None for fewer than eight, too few to tell."""
     if len(bearing_rad) < 8:
         return None
-    return float(np.median(np.abs((np.diff(bearing_rad) + math.pi) % TURN - math.pi)))
+    gaps = kernels.gaps_between(bearing_rad)
+    middle = len(gaps) // 2
+    if len(gaps) % 2:
+        return float(np.partition(gaps, middle)[middle])
+    return float(np.partition(gaps, [middle - 1, middle])[middle - 1 : middle + 1].mean())
 
 
 def sight_of_beams(
@@ -95,19 +92,17 @@ def sight_of_beams(
 
     A finite range beyond range_max_m is an obstacle where it says, but frees nothing.
     """
-    along = (bearing_rad - (bearing_rad[0] if len(bearing_rad) else 0.0)) % TURN
-    order = np.argsort(along, kind="stable")
-    along, length = along[order], range_m[order].copy()
-    if len(along) == 0:
+    if len(bearing_rad) == 0:
         empty = np.empty(0)
         return Sight(virtual_from_sensor, empty, empty, empty, empty, empty)
-    gap = np.append(np.diff(along), along[0] + TURN - along[-1])
-    reach = np.where(gap <= GAP_MAX_SPACINGS * spacing_rad * (1.0 + 1e-6), 0.5 * gap, 0.5 * spacing_rad)
-    lo = bearing_rad[0] + along - np.roll(reach, 1)
-    hi = bearing_rad[0] + along + reach
-    looked = (length >= 0.0) | np.isneginf(length)
-    length[np.isposinf(length)] = range_max_m
-    sees = looked & (length > 0.0) & (length <= range_max_m) & np.isfinite(length)
+    ordered, distance = bearing_rad, range_m
+    if not (np.all(bearing_rad[1:] >= bearing_rad[:-1]) and bearing_rad[-1] - bearing_rad[0] < TURN):
+        along = (bearing_rad - bearing_rad[0]) % TURN
+        order = np.argsort(along, kind="stable")
+        ordered, distance = bearing_rad[0] + along[order], range_m[order]
+    gap_max_rad = GAP_MAX_SPACINGS * spacing_rad * (1.0 + 1e-6)
+    lo, hi, length = kernels.thin_sectors(ordered, distance, range_max_m, gap_max_rad, spacing_rad)
+    sees, looked = length > 0.0, ~np.isnan(length)
     return Sight(virtual_from_sensor, lo[sees], hi[sees], length[sees], lo[looked], hi[looked])
 
 
@@ -152,10 +147,9 @@ def _arc_directions(cone_rad: float) -> tuple[F64, F64, F64]:
 
 def end_points(bearing_rad: F64, range_m: F64, *, range_min_m: float, virtual_from_sensor: Pose2) -> F64:
     """(M, 2) obstacles of a fan of beams, virtual sensor frame; what is too close stands at range_min_m."""
-    hit = (np.isfinite(range_m) & (range_m >= 0.0)) | np.isneginf(range_m)
-    r = np.maximum(np.where(np.isneginf(range_m[hit]), range_min_m, range_m[hit]), _LEAST_RANGE_M)
-    a = bearing_rad[hit]
-    return virtual_from_sensor.apply(np.stack((r * np.cos(a), r * np.sin(a)), axis=-1))
+    pose = virtual_from_sensor
+    points: F64 = kernels.beam_ends(bearing_rad, range_m, range_min_m, _LEAST_RANGE_M, pose.x_m, pose.y_m, pose.yaw_rad)
+    return points
 
 
 def arc_of_cone(*, cone_rad: float, range_m: float, virtual_from_transducer: Pose2) -> tuple[F64, F64]:

@@ -21,7 +21,7 @@ from mapping.frames import (
     wrap_angle,
     wrap_angles,
 )
-from mapping.pose_buffer import interpolate_many
+from mapping.pose_buffer import PoseBuffer
 
 LENGTH = st.floats(-100.0, 100.0)
 ANGLE = st.floats(-10.0, 10.0)
@@ -92,9 +92,11 @@ def test_interpolation_reaches_its_ends_and_is_the_same_backwards(a: Pose2, b: P
 def test_array_form_agrees_with_the_single_one(a: Pose2, b: Pose2, share: float) -> None:
     if abs(abs(wrap_angle(b.yaw_rad - a.yaw_rad)) - math.pi) < 1e-9:
         return
-    rows = [np.array([[p.x_m, p.y_m, p.yaw_rad]]) for p in (a, b)]
-    x, y, yaw = interpolate_many(rows[0], rows[1], np.array([share]))[0]
-    assert_same(Pose2(x, y, yaw), interpolate(a, b, share))
+    track = PoseBuffer()
+    track.add(0, a)
+    track.add(1_000_000_000, b)
+    stamp_ns = round(share * 1e9)
+    assert_same(track.at(stamp_ns), interpolate(a, b, stamp_ns * 1e-9), tolerance=1e-6)
 
 
 @pytest.mark.parametrize("share", [-0.01, 1.01, math.nan])

@@ -1,0 +1,97 @@
+"""Compiled loops about a sensor that moves while it measures: a pose for every beam, the sweep as of one instant."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+TWO_PI = 2.0 * math.pi
+SMALL_RAD = 1e-6
+
+
+@njit(cache=True, nogil=True)
+def wrapped(angle: float) -> float:
+    """The same angle in [-pi, pi)."""
+    return (angle + math.pi) % TWO_PI - math.pi
+
+
+@njit(cache=True, nogil=True)
+def arc_coefficients(w: float) -> tuple[float, float]:
+    """sin(w)/w and (1 - cos(w))/w, by series near 0."""
+    if abs(w) < SMALL_RAD:
+        return 1.0 - w * w / 6.0, w / 2.0
+    return math.sin(w) / w, (1.0 - math.cos(w)) / w
+
+
+@njit(cache=True, nogil=True)
+def poses_at(asked: Any, stamps: Any, pose: Any, stretch: Any, found: Any) -> bool:
+    """Poses at asked times (N,) along arcs of constant twist between the two poses around each, into found (N, 3).
+
+    stamps: (M,) rising, M >= 2, around all that is asked.  False if an arc would cross from one stretch to another.
+    """
+    known = -1  # the arc whose coefficients are at hand
+    at = 1
+    cos = sin = vx = vy = turn = span = 0.0
+    for k in range(len(asked)):
+        t = asked[k]
+        if t < stamps[at - 1] or t > stamps[at]:
+            at = min(max(np.searchsorted(stamps, t), 1), len(stamps) - 1)
+        if at != known:
+            known = at
+            x0, y0, yaw0 = pose[at - 1, 0], pose[at - 1, 1], pose[at - 1, 2]
+            cos, sin = math.cos(yaw0), math.sin(yaw0)
+            turn = wrapped(pose[at, 2] - yaw0)
+            a, b = arc_coefficients(turn)
+            dx, dy = pose[at, 0] - x0, pose[at, 1] - y0
+            x, y = cos * dx + sin * dy, cos * dy - sin * dx  # the motion in the start's frame
+            norm = a * a + b * b
+            vx, vy = (a * x + b * y) / norm, (a * y - b * x) / norm
+            span = float(stamps[at] - stamps[at - 1])
+        if stretch[at] != stretch[at - 1] and t != stamps[at - 1] and t != stamps[at]:
+            return False
+        share = (t - stamps[at - 1]) / span
+        a, b = arc_coefficients(share * turn)
+        x, y = share * (a * vx - b * vy), share * (b * vx + a * vy)
+        found[k, 0] = pose[at - 1, 0] + cos * x - sin * y
+        found[k, 1] = pose[at - 1, 1] + sin * x + cos * y
+        found[k, 2] = wrapped(pose[at - 1, 2] + share * turn)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def carried(pose: Any, x: float, y: float, yaw: float) -> Any:
+    """(N, 3) poses a_from_c of many a_from_b (N, 3) and one b_from_c; yaw is not wrapped."""
+    moved = np.empty_like(pose)
+    for k in range(len(pose)):
+        cos, sin = math.cos(pose[k, 2]), math.sin(pose[k, 2])
+        moved[k, 0] = pose[k, 0] + cos * x - sin * y
+        moved[k, 1] = pose[k, 1] + sin * x + cos * y
+        moved[k, 2] = pose[k, 2] + yaw
+    return moved
+
+
+@njit(cache=True, nogil=True)
+def seen_at_once(
+    sensor: Any, ref_x: float, ref_y: float, ref_yaw: float, bearing: Any, distance: Any
+) -> tuple[Any, Any, Any]:
+    """Beams, each measured from its own pose sensor (N, 3), as seen from one pose of the same frame.
+
+    Returns bearings and ranges (N,) and where each beam started (N, 2). A beam without a length is turned, not moved.
+    """
+    count = len(bearing)
+    new_bearing, new_distance, origin = np.empty(count), np.empty(count), np.empty((count, 2))
+    cos, sin = math.cos(ref_yaw), math.sin(ref_yaw)
+    for k in range(count):
+        dx, dy = sensor[k, 0] - ref_x, sensor[k, 1] - ref_y
+        ox, oy = cos * dx + sin * dy, cos * dy - sin * dx
+        origin[k, 0], origin[k, 1] = ox, oy
+        angle = bearing[k] + wrapped(sensor[k, 2] - ref_yaw)
+        if math.isfinite(distance[k]):
+            x, y = ox + distance[k] * math.cos(angle), oy + distance[k] * math.sin(angle)
+            new_bearing[k], new_distance[k] = math.atan2(y, x), math.hypot(x, y)
+        else:
+            new_bearing[k], new_distance[k] = wrapped(angle), distance[k]
+    return new_bearing, new_distance, origin
