@@ -62,6 +62,26 @@ def poses_at(asked: Any, stamps: Any, pose: Any, stretch: Any, found: Any) -> bo
 
 
 @njit(cache=True, nogil=True)
+def along_arc(start: Any, end: Any, share: Any) -> Any:
+    """(N, 3) poses at shares (N,) of the way from one pose (3,) to another along the arc of constant twist."""
+    found = np.empty((len(share), 3))
+    cos, sin = math.cos(start[2]), math.sin(start[2])
+    turn = wrapped(end[2] - start[2])
+    a, b = arc_coefficients(turn)
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    x, y = cos * dx + sin * dy, cos * dy - sin * dx
+    norm = a * a + b * b
+    vx, vy = (a * x + b * y) / norm, (a * y - b * x) / norm
+    for k in range(len(share)):
+        a, b = arc_coefficients(share[k] * turn)
+        x, y = share[k] * (a * vx - b * vy), share[k] * (b * vx + a * vy)
+        found[k, 0] = start[0] + cos * x - sin * y
+        found[k, 1] = start[1] + sin * x + cos * y
+        found[k, 2] = wrapped(start[2] + share[k] * turn)
+    return found
+
+
+@njit(cache=True, nogil=True)
 def carried(pose: Any, x: float, y: float, yaw: float) -> Any:
     """(N, 3) poses a_from_c of many a_from_b (N, 3) and one b_from_c; yaw is not wrapped."""
     moved = np.empty_like(pose)

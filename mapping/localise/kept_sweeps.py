@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import wrap_angles
+from mapping.kernels import motion
 from mapping.localise.pose_graph import composed_poses
-from mapping.pose_buffer import interpolate_many
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -65,8 +65,8 @@ class KeptSweep:
         if np.array_equal(ends[0], ends[1]):
             return composed_poses(ends[:1], base_from_sensor[None, :])
         share = np.linspace(0.0, 1.0, len(self.codes))
-        start, end = (np.repeat(row[None, :], len(share), axis=0) for row in ends)
-        return composed_poses(interpolate_many(start, end, share), np.broadcast_to(base_from_sensor, (len(share), 3)))
+        between = motion.along_arc(ends[0], ends[1], share)
+        return composed_poses(between, np.broadcast_to(base_from_sensor, (len(share), 3)))
 
 
 def kept_sweep(sensor: str, scan: Scan, *, key: int, in_key: F64, known_bearing_rad: F32 | None = None) -> KeptSweep:
