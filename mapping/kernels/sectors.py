@@ -321,7 +321,9 @@ def star_border(lo: Any, hi: Any, length: Any, x: float, y: float, yaw: float) -
 def well_inside(x: float, y: float, sector: int, edge_x: Any, edge_y: Any) -> bool:
     """Whether a point lies in a sector narrower than half a turn and nowhere near its edges."""
     slack = CLEAR_RAD * (abs(x) + abs(y))
-    return edge_x[sector] * y - edge_y[sector] * x > slack and edge_y[sector + 1] * x - edge_x[sector + 1] * y > slack
+    past_lower = edge_x[sector] * y - edge_y[sector] * x
+    before_upper = edge_y[sector + 1] * x - edge_x[sector + 1] * y
+    return bool(past_lower > slack and before_upper > slack)
 
 
 @njit(cache=True, nogil=True)
