@@ -172,7 +172,33 @@ class AttitudeReading:
     rates_rad_s: tuple[float, float, float]
 
 
-Reading = ScanReading | ChainReading | WheelReading | AngleReading | ContactReading | PoseReading | AttitudeReading
+@dataclass(frozen=True, slots=True)
+class RingReading:
+    """One look of a robot with rings of photo and touch sensors, the first to the front, the rest counter-clockwise.
+
+    light: (N,) 0 to 1 of full scale.  touch: (N,) whether each one feels something.  ahead_m, left_m: the way since
+    the first look after connecting, in the body's frame; only differences mean anything.  continuous is False for the
+    first look after a connection, a reset or a gap: motion between it and the one before is unknown, not zero.
+    """
+
+    stamp_ns: int
+    light: F64
+    touch: NDArray[np.bool_]
+    ahead_m: float
+    left_m: float
+    continuous: bool
+
+
+Reading = (
+    ScanReading
+    | ChainReading
+    | WheelReading
+    | AngleReading
+    | ContactReading
+    | PoseReading
+    | AttitudeReading
+    | RingReading
+)
 
 
 class LinkState(IntEnum):
