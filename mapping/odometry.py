@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import IDENTITY, Pose2, exp_se2
+from mapping.kernels import motion as kernels
 
 F64 = NDArray[np.float64]
 
@@ -105,16 +106,11 @@ class DifferentialOdometry:
         forward, turn = (left_m + right_m) / 2.0, (right_m - left_m) / track
         step = exp_se2((forward, 0.0, turn))
         heading = self._pose.yaw_rad + turn / 2.0  # of the chord
-        c, s = math.cos(heading), math.sin(heading)
         chord = math.hypot(step.x_m, step.y_m) * math.copysign(1.0, forward)
-        by_pose = np.array([[1.0, 0.0, -s * chord], [0.0, 1.0, c * chord], [0.0, 0.0, 1.0]])
-        # Derivatives of the step by the two travels; the chord's own turn is half the step's.
-        half_x, half_y = s * chord / (2.0 * track), c * chord / (2.0 * track)
-        by_travel = np.array(
-            [[c / 2.0 + half_x, c / 2.0 - half_x], [s / 2.0 - half_y, s / 2.0 + half_y], [-1.0 / track, 1.0 / track]]
+        noise = self._geometry.travel_noise_m_per_sqrt_m**2
+        self._covariance = kernels.rolled_covariance(
+            self._covariance, heading, chord, track, noise * abs(left_m), noise * abs(right_m)
         )
-        noise = self._geometry.travel_noise_m_per_sqrt_m**2 * np.diag([abs(left_m), abs(right_m)])
-        self._covariance = by_pose @ self._covariance @ by_pose.T + by_travel @ noise @ by_travel.T
         self._pose = self._pose @ step
         return forward, turn
 

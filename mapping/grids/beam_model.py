@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.kernels import grids as kernels
+from mapping.kernels import motion
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -110,22 +111,11 @@ def beams_of_scan(
     pose = np.asarray(map_from_sensor, dtype=np.float64)
     if pose.shape not in ((n, 3), (3,)):
         raise ValueError(f"poses are (N, 3) with N = {n} beams, or (3,), got {pose.shape}")
-    pose = np.broadcast_to(pose, (n, 3))
-    reach = min(scan.range_max_m, use_max_m)
-    measured = (scan.range_m >= 0.0) & (scan.range_m <= scan.range_max_m)
-    nothing_seen = (scan.range_m == np.inf) & clear_no_return
-    too_close = (scan.range_m == -np.inf) & (scan.range_min_m > 0.0)
-    placed = np.all(np.isfinite(pose), axis=1)
-    length = np.where(measured, np.minimum(scan.range_m, reach), np.nan)
-    length = np.where(nothing_seen, reach, np.where(too_close, scan.range_min_m, length))
-    bearing = scan.bearing_rad + pose[:, 2]
-    end = pose[:, :2] + length[:, None] * np.stack((np.cos(bearing), np.sin(bearing)), axis=-1)
-    return Beams(
-        origin_m=np.ascontiguousarray(pose[:, :2]),
-        end_m=end,
-        free=(measured | nothing_seen) & placed,
-        hit=((measured & (scan.range_m <= reach)) | too_close) & placed,
-    )
+    origin, end, free, hit = motion.beam_lines(
+        np.ascontiguousarray(np.broadcast_to(pose, (n, 3))), scan.bearing_rad, scan.range_m, scan.range_min_m,
+        scan.range_max_m, min(scan.range_max_m, use_max_m), clear_no_return,
+    )  # fmt: skip
+    return Beams(origin_m=origin, end_m=end, free=free, hit=hit)
 
 
 @dataclass(frozen=True, slots=True)

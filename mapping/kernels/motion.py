@@ -115,3 +115,61 @@ def seen_at_once(
         else:
             new_bearing[k], new_distance[k] = wrapped(angle), distance[k]
     return new_bearing, new_distance, origin
+
+
+@njit(cache=True, nogil=True)
+def rolled_covariance(
+    covariance: Any, heading: float, chord: float, track: float, left_var: float, right_var: float
+) -> Any:
+    """Covariance (3, 3) of x, y, yaw after both wheels of a differential drive rolled on along an arc.
+
+    heading, chord: of the straight way between the arc's ends.  left_var, right_var: of the two travels, in m^2.
+    """
+    c, s = math.cos(heading), math.sin(heading)
+    by_pose = np.eye(3)
+    by_pose[0, 2], by_pose[1, 2] = -s * chord, c * chord
+    # Derivatives of the step by the two travels; the chord's own turn is half the step's.
+    half_x, half_y = s * chord / (2.0 * track), c * chord / (2.0 * track)
+    by_travel = np.empty((3, 2))
+    by_travel[0, 0], by_travel[0, 1] = c / 2.0 + half_x, c / 2.0 - half_x
+    by_travel[1, 0], by_travel[1, 1] = s / 2.0 - half_y, s / 2.0 + half_y
+    by_travel[2, 0], by_travel[2, 1] = -1.0 / track, 1.0 / track
+    moved = np.zeros((3, 3))
+    for row in range(3):
+        for col in range(3):
+            for i in range(3):
+                for j in range(3):
+                    moved[row, col] += by_pose[row, i] * covariance[i, j] * by_pose[col, j]
+            moved[row, col] += by_travel[row, 0] * left_var * by_travel[col, 0]
+            moved[row, col] += by_travel[row, 1] * right_var * by_travel[col, 1]
+    return moved
+
+
+@njit(cache=True, nogil=True)
+def beam_lines(
+    pose: Any, bearing: Any, distance: Any, range_min: float, range_max: float, reach: float, clear_no_return: bool
+) -> tuple[Any, Any, Any, Any]:
+    """Beams from a pose each (N, 3): where they start and end (N, 2), whether they prove free space, and an obstacle.
+
+    reach: of a beam that saw nothing, and beyond which one is cut.  A beam that proves nothing ends at NaN.
+    """
+    count = len(bearing)
+    origin, end = np.empty((count, 2)), np.empty((count, 2))
+    free, hit = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+    for k in range(count):
+        x, y, yaw, r = pose[k, 0], pose[k, 1], pose[k, 2], distance[k]
+        origin[k, 0], origin[k, 1] = x, y
+        placed = math.isfinite(x) and math.isfinite(y) and math.isfinite(yaw)
+        length = math.nan
+        if 0.0 <= r <= range_max:
+            length = min(r, reach)
+            free[k], hit[k] = placed, placed and r <= reach
+        elif r == math.inf and clear_no_return:
+            length = reach
+            free[k] = placed
+        elif r == -math.inf and range_min > 0.0:
+            length = range_min
+            hit[k] = placed
+        angle = bearing[k] + yaw
+        end[k, 0], end[k, 1] = x + length * math.cos(angle), y + length * math.sin(angle)
+    return origin, end, free, hit
