@@ -119,6 +119,32 @@ def planes(
     _tell(found.report, [write_planes(found, path) for path in (out, _as_png(png)) if path is not None], as_json)
 
 
+@app.command()
+def regions(
+    file: Annotated[Path, typer.Argument(help="A floor plan in GeoJSON, in metres: polygons, or a line map.")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=".geojson; default: to the screen.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw them, too.")] = None,
+    simplify_m: Annotated[float, typer.Option(min=0.0, help="Leave out corners that stand out less.")] = 0.0,
+    door_m: Annotated[float, typer.Option(min=0.0, help="Wider passages join regions to one room.")] = 1.3,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON; needs --out or --png.")] = False,
+) -> None:
+    """Convex free regions, the passages between them, and the rooms these make.
+
+    Example: umfeld extract regions plan.geojson --out regions.geojson --png regions.png
+    """
+    from service.errors import WrongUsage
+    from service.region_files import geojson_bytes, regions_of_file, write_regions
+
+    if as_json and out is None and png is None:
+        raise WrongUsage("--json reports on files: say where with --out or --png (without them GeoJSON is printed)")
+    found = regions_of_file(file, simplify_m=simplify_m, door_m=door_m)
+    if out is None and png is None:
+        typer.echo(geojson_bytes(found).decode(), nl=False)
+        return
+    _tell(found.report, [write_regions(found, path) for path in (out, _as_png(png)) if path is not None], as_json)
+
+
 def _tell(facts: dict[str, object], written: Sequence[Receipt], as_json: bool) -> None:
     """The report on the screen."""
     if as_json:
