@@ -13,7 +13,7 @@ FUZZ_CASES ?= 300000
 FUZZ_ROUNDS ?= 10
 SOAK ?= 20
 
-.PHONY: help venv demo test lint bench fuzz soak hil interop format clean
+.PHONY: help venv demo test lint bench ledger fuzz soak hil interop format clean
 
 help:  ## This list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -38,6 +38,9 @@ lint: venv  ## ruff, mypy strict, import-linter
 
 bench: venv  ## Latency, load, start and kernels against their budgets (docs/performance.md)
 	$(BIN)/umfeld bench --all $(ARGS)
+
+ledger: venv  ## Every emulated device under every fault: docs/fault-ledger.md anew
+	$(BIN)/python -m bench.fault_ledger $(ARGS)
 
 hil: venv  ## Driver tests on hardware: make hil DEVICE=laser=/dev/ttyACM0 (docs/testing.md)
 	$(if $(DEVICE),,$(error name the hardware: make hil DEVICE=laser=/dev/ttyACM0))

@@ -158,8 +158,8 @@ class SickLms2xxConversation(ScriptedConversation[Telegram]):
         for _ in range(12):  # for as long as there is a sign of life at this speed
             heard = self._heard
             reply = yield from self._ask(STOP, _is(MODE), PROBE_NS)
-            if reply is not None:
-                return True
+            if reply is not None and (yield from self._ask(ASK_STATUS, _is(STATUS), PROBE_NS)) is not None:
+                return True  # twice: a reply that was held up may come when another speed is tried already
             if self._heard == heard:
                 return False
         return False

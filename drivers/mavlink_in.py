@@ -158,8 +158,11 @@ class MavlinkConversation:
         return min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
 
     def silence_limit_of(self, kind: type[Reading]) -> int:
-        """The same for all kinds: they are asked for at one rate. Sensors of distance may be slow by nature."""
-        return _MOST_SILENCE_NS if kind is ChainReading else self.silence_limit_ns
+        """Three periods: as asked for, or as sensors of distance were heard to take, which may be slow by nature."""
+        if kind is not ChainReading:
+            return self.silence_limit_ns
+        slowest_ns = max(self._intervals_ns.values(), default=_MOST_SILENCE_NS)
+        return min(max(3 * round(slowest_ns), self.silence_limit_ns), _MOST_SILENCE_NS)
 
     # ---- how it is driven
 
@@ -179,6 +182,8 @@ class MavlinkConversation:
         self._request_due_ns = now_ns
         self._heard_ns: dict[int, int] = {}
         self._resets: int | None = None
+        self._sensor_ns: dict[int, int] = {}  # when each sensor of distance was last heard
+        self._intervals_ns: dict[int, float] = {}  # and how long it takes from one to the next
 
     def requests(self, now_ns: int) -> Sequence[bytes | SetBaudRate]:
         self._now_ns = now_ns
@@ -276,8 +281,17 @@ class MavlinkConversation:
             range_m, status = -math.inf, RangeStatus.TOO_CLOSE
         elif current > most:
             range_m, status = math.inf, RangeStatus.NO_RETURN
+        self._note_interval(sensor, stamp_ns)
         stamp_ns = self._rising(ChainReading, stamp_ns)
         return ChainReading(stamp_ns, (RangeReading(sensor + 1, range_m, status),))
+
+    def _note_interval(self, sensor: int, stamp_ns: int) -> None:
+        last_ns = self._sensor_ns.get(sensor)
+        self._sensor_ns[sensor] = stamp_ns
+        if last_ns is not None:
+            interval_ns = min(stamp_ns - last_ns, _MOST_SILENCE_NS)
+            known_ns = self._intervals_ns.get(sensor, interval_ns)
+            self._intervals_ns[sensor] = known_ns + 0.2 * (interval_ns - known_ns)
 
     def _wheel_ways(self, values: tuple[float, ...], stamp_ns: int) -> WheelReading | None:
         count = int(values[17])

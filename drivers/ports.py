@@ -232,7 +232,7 @@ class TcpPort:
         clock: Clock,
         connect_timeout_s: float = 0.5,
         write_timeout_s: float = 0.25,
-        silence_reopen_s: float | None = 2.0,
+        silence_reopen_s: float | None = 1.5,
     ) -> None:
         self.name = f"tcp://{host}:{port}"
         self.drops: dict[str, int] = {}
@@ -302,7 +302,7 @@ class CanPort:
         bitrate_bps: int = 1_000_000,
         clock: Clock,
         write_timeout_s: float = 0.1,
-        silence_reopen_s: float | None = 3.0,
+        silence_reopen_s: float | None = 1.5,
     ) -> None:
         self.name = f"{interface}:{channel}"
         self.drops: dict[str, int] = {}

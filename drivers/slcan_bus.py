@@ -17,12 +17,13 @@ from __future__ import annotations
 
 import re
 from collections import deque
+from typing import Protocol
 
 import can
 
 from drivers.conversation import CanFrame
 from drivers.errors import PortError
-from drivers.ports import Clock, SerialPort
+from drivers.ports import Clock, Port, SerialPort
 
 _RATE_COMMANDS = {
     10_000: "S0",
@@ -42,20 +43,41 @@ _REFUSALS = 8  # so many BELs in a row, and nothing else heard: the adapter is c
 _MOST_QUEUED = 10_000
 
 
+class Line(Port[bytes], Protocol):
+    """What the adapter hangs on."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+    def discard_input(self) -> None:
+        """Throw away what arrived but was not read."""
+
+
 class LawicelBus(can.BusABC):
     """A CAN adapter at the end of a serial line. Raises PortError (and its family) when the line is lost.
 
     channel: path of the serial port, "@115200" may follow.  drops: counts `slcan_malformed`, `slcan_refused`.
+    line: used instead of opening that port.
     """
 
-    def __init__(self, channel: str, *, bitrate_bps: int, clock: Clock, drops: dict[str, int] | None = None) -> None:
+    def __init__(
+        self,
+        channel: str,
+        *,
+        bitrate_bps: int,
+        clock: Clock,
+        drops: dict[str, int] | None = None,
+        line: Line | None = None,
+    ) -> None:
         if bitrate_bps not in _RATE_COMMANDS:
             rates = ", ".join(str(rate) for rate in _RATE_COMMANDS)
             raise PortError(f"an slcan adapter cannot run at {bitrate_bps} bit/s: choose one of {rates}")
         path, _, baud = channel.partition("@")
         self.drops = drops if drops is not None else {}
         self.channel_info = f"slcan on {path}"
-        self._line = SerialPort(path, baud=int(baud) if baud.isdigit() else 115200, clock=clock)
+        speed = int(baud) if baud.isdigit() else 115200
+        self._line: Line = SerialPort(path, baud=speed, clock=clock) if line is None else line
         self._buffer = bytearray()
         self._frames: deque[can.Message] = deque()
         self._refusals = 0
@@ -84,7 +106,8 @@ class LawicelBus(can.BusABC):
             self._line.close()
 
     def fileno(self) -> int:
-        return self._line.fileno()
+        descriptor = self._line.fileno()
+        return -1 if descriptor is None else descriptor
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame; None after timeout, or sooner if what arrived was no frame. Waits by no clock."""

@@ -178,8 +178,9 @@ class MaxBotixConversation:
     @property
     def silence_limit_ns(self) -> int:
         limit_ns = min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
-        # Lines of labelled sensors come in between; a list, or one slow sensor, may come less often than every 500 ms.
-        return max(limit_ns, self._period_ns * 3 // 2)
+        if self._form == "labelled":  # other channels' lines come in between
+            return limit_ns
+        return max(limit_ns, self._period_ns * 3 // 2)  # a list, or one slow sensor, may come less often than that
 
     # ---- how it is driven
 

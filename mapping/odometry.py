@@ -16,6 +16,8 @@ from mapping.frames import IDENTITY, Pose2, exp_se2
 from mapping.kernels import motion as kernels
 
 F64 = NDArray[np.float64]
+_POSE_SLACK_M = 0.02  # estimators correct themselves by so much between two poses
+_REFUSED_IN_A_ROW = 5  # then the new place is believed, and what lay between is unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,3 +123,59 @@ class DifferentialOdometry:
 
     def _state(self, stamp_ns: int, forward_m_s: float, yaw_rad_s: float, *, broken: bool) -> OdometryState:
         return OdometryState(stamp_ns, self._pose, self._covariance.copy(), forward_m_s, yaw_rad_s, broken)
+
+
+class FollowedPoses:
+    """Another estimator's poses as odometry: its steps are followed, its jumps are not.
+
+    The odom frame is where it was first heard, so that an estimator that begins anew elsewhere moves nothing. Its
+    errors are not told, so they are taken to grow with the way, as a wheel's do.
+    max_speed_m_s: a faster step is no motion.  noise_m_per_sqrt_m, noise_rad_per_sqrt_m: deviation after one metre.
+    """
+
+    def __init__(
+        self, *, max_speed_m_s: float, noise_m_per_sqrt_m: float = 0.02, noise_rad_per_sqrt_m: float = 0.02
+    ) -> None:
+        self._max_speed_m_s = max_speed_m_s
+        self._noise = (noise_m_per_sqrt_m, noise_rad_per_sqrt_m)
+        self._pose = IDENTITY
+        self._covariance: F64 = np.zeros((3, 3))
+        self._last: tuple[int, Pose2] | None = None
+        self._refused = 0
+
+    def update(self, stamp_ns: int, pose: Pose2, *, continuous: bool = True) -> OdometryState | None:
+        """Take a pose in the estimator's own frame; None if no robot moves like that.
+
+        continuous=False: it began anew, so the motion since its last pose is not known. ValueError if the stamp does
+        not rise.
+        """
+        last = self._last
+        if last is not None and stamp_ns <= last[0]:
+            raise ValueError(f"stamps must rise: {stamp_ns} after {last[0]}")
+        if last is None:
+            self._last = (stamp_ns, pose)
+            return OdometryState(stamp_ns, self._pose, self._covariance.copy(), 0.0, 0.0, False)
+        seconds = (stamp_ns - last[0]) * 1e-9
+        step = last[1].inverse() @ pose
+        way_m = math.hypot(step.x_m, step.y_m)
+        if continuous and way_m > self._max_speed_m_s * seconds + _POSE_SLACK_M:
+            self._refused += 1
+            if self._refused <= _REFUSED_IN_A_ROW:
+                return None
+            continuous = False  # it stays there: a jump of the estimator
+        self._refused = 0
+        self._last = (stamp_ns, pose)
+        if not continuous:
+            reach = (self._max_speed_m_s * seconds) ** 2
+            self._covariance = self._covariance + np.diag([reach, reach, min(seconds**2, math.pi**2)])
+            return OdometryState(stamp_ns, self._pose, self._covariance.copy(), 0.0, 0.0, True)
+        turn = math.remainder(step.yaw_rad, 2.0 * math.pi)
+        c, s = math.cos(self._pose.yaw_rad), math.sin(self._pose.yaw_rad)
+        across, along = c * step.y_m + s * step.x_m, c * step.x_m - s * step.y_m
+        by_pose = np.array([[1.0, 0.0, -across], [0.0, 1.0, along], [0.0, 0.0, 1.0]])
+        noise_m, noise_rad = self._noise
+        way = way_m + 0.1 * abs(turn)
+        noise = np.diag([noise_m**2 * way, noise_m**2 * way, noise_rad**2 * way])
+        self._covariance = by_pose @ self._covariance @ by_pose.T + noise
+        self._pose = self._pose @ step
+        return OdometryState(stamp_ns, self._pose, self._covariance.copy(), step.x_m / seconds, turn / seconds, False)

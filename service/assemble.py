@@ -16,7 +16,19 @@ import numpy as np
 from drivers.conversation import Conversation
 from drivers.ports import Clock, Port, Tap
 from drivers.reader import Sink, WireReader
-from drivers.readings import AngleReading, ChainReading, RangeReading, RangeStatus, Reading, ScanReading, WheelReading
+from drivers.readings import (
+    AngleReading,
+    ChainReading,
+    ContactLine,
+    ContactReading,
+    ContactState,
+    PoseReading,
+    RangeReading,
+    RangeStatus,
+    Reading,
+    ScanReading,
+    WheelReading,
+)
 from mapping.frames import Pose2, Pose3
 from mapping.odometry import DriveGeometry
 from mapping.planes.cloud import TiltMount
@@ -25,6 +37,7 @@ from service.config_base import PlanePose
 from service.config_devices import (
     SERIAL_NUMBER,
     SHARED_DRIVERS,
+    ArduinoContacts,
     ArduinoSonars,
     ArduinoWheels,
     CanBus,
@@ -34,6 +47,7 @@ from service.config_devices import (
     Drive,
     HokuyoLaser,
     LdrobotLaser,
+    MavlinkPose,
     MavlinkSonars,
     MavlinkWheels,
     MaxBotixSonars,
@@ -50,7 +64,17 @@ from service.config_devices import (
 )
 from service.fusion import SECTOR_MEMORY_NS, Fusion, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer
 from service.mounts import MountSettings, TiltingLaser
-from service.sensors import AxleEncoder, Chain, Laser, Sensor, Transducer, Wheels
+from service.sensors import (
+    AxleEncoder,
+    Chain,
+    Contacts,
+    Laser,
+    PoseSource,
+    Sensor,
+    Switch,
+    Transducer,
+    Wheels,
+)
 
 if TYPE_CHECKING:
     from drivers.encoder_arduino_bridge import ArduinoBridgeConversation
@@ -143,13 +167,22 @@ def _shares_of(devices: Mapping[str, Device]) -> dict[str, Conversation[Any]]:
     """One new board or autopilot as the sources that it is."""
     from drivers.shares import share_out
 
-    kinds: dict[str, type[Reading]] = {
-        source: WheelReading if isinstance(device, ArduinoWheels | MavlinkWheels) else ChainReading
-        for source, device in devices.items()
-    }
-    if any(isinstance(device, MavlinkWheels | MavlinkSonars) for device in devices.values()):
+    kinds: dict[str, type[Reading]] = {source: _reading_of(device) for source, device in devices.items()}
+    if any(isinstance(device, MavlinkWheels | MavlinkSonars | MavlinkPose) for device in devices.values()):
         return share_out(_mavlink(list(devices.values())), kinds)
     return share_out(_arduino_board(list(devices.values())), kinds)
+
+
+def _reading_of(device: Device) -> type[Reading]:
+    """What a source on a shared board says."""
+    match device:
+        case ArduinoWheels() | MavlinkWheels():
+            return WheelReading
+        case ArduinoContacts():
+            return ContactReading
+        case MavlinkPose():
+            return PoseReading
+    return ChainReading
 
 
 def _arduino_board(devices: Sequence[Device]) -> ArduinoBridgeConversation:
@@ -172,6 +205,12 @@ def _arduino_board(devices: Sequence[Device]) -> ArduinoBridgeConversation:
                 "zero_is_free": device.zero_is_free,
                 "baud_bps": device.baud_bps,
             }
+        elif isinstance(device, ArduinoContacts):
+            settings |= {
+                "contacts": {switch.line: switch.tripped == "low" for switch in device.switches},
+                "contact_rate_hz": device.rate_hz,
+                "baud_bps": device.baud_bps,
+            }
     return ArduinoBridgeConversation(**settings)
 
 
@@ -181,13 +220,13 @@ def _mavlink(devices: Sequence[Device]) -> MavlinkConversation:
     kinds: list[type[Reading]] = []
     settings: dict[str, Any] = {}
     for device in devices:
-        if not isinstance(device, MavlinkSonars | MavlinkWheels):
+        if not isinstance(device, MavlinkSonars | MavlinkWheels | MavlinkPose):
             continue
         on_udp = device.port.startswith(_UDP)
         settings["baud_bps"] = 0 if on_udp else device.baud_bps
         settings["system"] = settings.get("system") or device.system
         settings["rate_hz"] = max(settings.get("rate_hz", 0.0), device.rate_hz)
-        kinds.append(WheelReading if isinstance(device, MavlinkWheels) else ChainReading)
+        kinds.append(_reading_of(device))
         if isinstance(device, MavlinkWheels):
             settings["wheels"] = (device.wheel_left, device.wheel_right)
     return MavlinkConversation(kinds, **settings)
@@ -370,7 +409,7 @@ def conversation_of(device: Device) -> Conversation[Any]:
             return MaxBotixConversation(
                 device.family, form=device.lines, channels=_channels(device), period_s=_maxbotix_period_s(device)
             )
-        case ArduinoWheels() | ArduinoSonars() | MavlinkWheels() | MavlinkSonars():
+        case ArduinoWheels() | ArduinoSonars() | ArduinoContacts() | MavlinkWheels() | MavlinkSonars() | MavlinkPose():
             return _shares_of({"": device})[""]
         case _:
             raise TypeError(f"no driver for {type(device).__name__}")
@@ -410,11 +449,20 @@ def _sensor_of(source: str, device: Device) -> Sensor:
                 round(
                     1e9 * (_maxbotix_period_s(device) if isinstance(device, MaxBotixSonars) else 1.0 / device.rate_hz)
                 ),
+                unchecked=isinstance(device, MaxBotixSonars | ArduinoSonars),
             )
         case Cia406Wheels() | ArduinoWheels() | RoboClawWheels() | ODriveWheels() | VescWheels() | MavlinkWheels():
             return Wheels(source)
         case Cia406Mount():
             return AxleEncoder(source)
+        case ArduinoContacts():
+            switches = tuple(
+                Switch(each.line, Pose2(each.x_m, each.y_m, math.radians(each.yaw_deg)), each.width_m)
+                for each in device.switches
+            )
+            return Contacts(source, switches, round(1e9 / device.rate_hz), round(1e9 * device.hold_s))
+        case MavlinkPose():
+            return PoseSource(source)
         case _:
             raise TypeError(f"no sensor for {type(device).__name__}")
 
@@ -580,6 +628,7 @@ def parts(config: Config, found: Mapping[str, Sensor], made: Maps, localiser: Lo
         sectors=made.sectors,
         grids=made.grids,
         drive=drive,
+        pose_source=None if config.drive.pose_source is None else config.source_name("poses", config.drive.pose_source),
         max_wheel_speed_m_s=config.drive.max_wheel_speed_m_s,
         localiser=localiser,
         mounts=tilting_lasers(config),
@@ -637,7 +686,7 @@ def _sources(config: Config, references: Sequence[str] | None, found: Mapping[st
         return frozenset(
             name
             for name, sensor in found.items()
-            if isinstance(sensor, Chain) or (isinstance(sensor, Laser) and not sensor.tilts)
+            if isinstance(sensor, Chain | Contacts) or (isinstance(sensor, Laser) and not sensor.tilts)
         )
     return frozenset(config.source_name(*config.resolve(reference)) for reference in references)
 
@@ -681,7 +730,7 @@ def _mavlink_sources(config: Config) -> list[tuple[str, str]]:
     return [
         (config.source_name(section, name), device.port)
         for section, name, device in config.devices()
-        if isinstance(device, MavlinkSonars | MavlinkWheels)
+        if isinstance(device, MavlinkSonars | MavlinkWheels | MavlinkPose)
     ]
 
 
@@ -729,3 +778,8 @@ def _pretended(sensor: Sensor, step: int, now_ns: int) -> Reading:
             return WheelReading(now_ns, 100 * step, 100 * step, True)
         case AxleEncoder():
             return AngleReading(now_ns, 10 * step, step > 0)
+        case Contacts():
+            lines = tuple(ContactLine(each.line, ContactState.TRIPPED) for each in sensor.switches)
+            return ContactReading(now_ns, lines)
+        case PoseSource():
+            return PoseReading(now_ns, 0.1 * step, 0.0, 0.0, step > 0)

@@ -19,11 +19,13 @@ from service.config_around import Log, Mavlink, Network, RecordingSettings, Ros,
 from service.config_base import Name, Section
 from service.config_devices import (
     SHARED_DRIVERS,
+    ArduinoContacts,
     CanBus,
     Cia406Mount,
     Device,
     Drive,
     LaserDevice,
+    MavlinkPose,
     Robot,
     SonarDevice,
     WheelDevice,
@@ -42,8 +44,8 @@ from service.config_maps import (
 )
 from service.errors import WrongUsage
 
-SENSOR_SECTIONS = ("lasers", "sonars")
-DEVICE_SECTIONS = (*SENSOR_SECTIONS, "wheels", "mounts")
+SENSOR_SECTIONS = ("lasers", "sonars", "contacts")
+DEVICE_SECTIONS = (*SENSOR_SECTIONS, "wheels", "mounts", "poses")
 
 
 class Config(Section):
@@ -54,8 +56,10 @@ class Config(Section):
     can: dict[Name, CanBus] = Field(default={}, description="CAN buses by name.")
     lasers: dict[Name, LaserDevice] = Field(default={}, description="Laser rangefinders by name.")
     sonars: dict[Name, SonarDevice] = Field(default={}, description="Ultrasonic chains by name.")
+    contacts: dict[Name, ArduinoContacts] = Field(default={}, description="Bumpers and cliff switches by name.")
     wheels: dict[Name, WheelDevice] = Field(default={}, description="Wheel encoders by name.")
     mounts: dict[Name, Cia406Mount] = Field(default={}, description="Mounts that nod or turn a laser, by name.")
+    poses: dict[Name, MavlinkPose] = Field(default={}, description="Other estimators of the robot's pose by name.")
     sectors: SectorMaps = Field(default=SectorMaps(), description="Sector maps.")
     grid: Grid = Field(default=Grid(), description="The grid of the whole building.")
     local_grid: LocalGrid = Field(default=LocalGrid(), description="The grid around the robot.")
@@ -83,8 +87,8 @@ class Config(Section):
     def source_name(self, section: str, name: str) -> str:
         """The one name of a device in keys and reports: its own, with its section before it if an earlier one has it.
 
-        lasers come before sonars, sonars before wheels, wheels before mounts: with [lasers.front] and [sonars.front]
-        these are `front` and `sonars-front`.
+        lasers come before sonars, then contacts, wheels, mounts, poses: with [lasers.front] and [sonars.front] these
+        are `front` and `sonars-front`.
         """
         earlier = DEVICE_SECTIONS[: DEVICE_SECTIONS.index(section)]
         return f"{section}-{name}" if any(name in getattr(self, other) for other in earlier) else name
@@ -241,9 +245,10 @@ def _name_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
 
 
 def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
-    source = _table(data, "drive").get("source")
-    if isinstance(source, str) and source not in _table(data, "wheels"):
-        yield _missing(("drive", "source"), source, "wheels", data)
+    for key, section in (("source", "wheels"), ("pose_source", "poses")):
+        source = _table(data, "drive").get(key)
+        if isinstance(source, str) and source not in _table(data, section):
+            yield _missing(("drive", key), source, section, data)
     for section in DEVICE_SECTIONS:
         for name, device in _tables(data, section):
             bus = device.get("can")
@@ -328,6 +333,9 @@ def _unused_faults(config: Config, data: Mapping[str, Any]) -> Iterator[Fault]:
             yield Fault(
                 ("wheels", name), f'no drive uses it; add source = "{name}" to [drive], with the wheels\' measures'
             )
+    for name in config.poses:
+        if config.drive.pose_source is None and "pose_source" not in _table(data, "drive"):
+            yield Fault(("poses", name), f'no drive uses it; add pose_source = "{name}" to [drive]')
     polar = _table(data, "sectors", "polar")
     if config.mavlink.enabled and config.mavlink.map is None and len(polar) != 1:
         names = ", ".join(sorted(polar)) or "(none yet)"

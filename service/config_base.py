@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9_-]+$", max_length=64)]
-Reference = Annotated[str, Field(pattern=r"^((lasers|sonars)\.)?[a-z0-9_-]+$", max_length=80)]
+Reference = Annotated[str, Field(pattern=r"^((lasers|sonars|contacts)\.)?[a-z0-9_-]+$", max_length=80)]
 Positive = Annotated[float, Field(gt=0)]
 Point = tuple[float, float]
 

@@ -50,6 +50,9 @@ class Drive(Section):
     source: Name | None = Field(
         default=None, description="The [wheels.NAME] that counts; without one there is no odometry."
     )
+    pose_source: Name | None = Field(
+        default=None, description="A [poses.NAME] whose poses are the odometry instead of wheel counts."
+    )
     wheel_radius_left_m: Positive = Field(default=0.10, description="Rolling radius of the left wheel.")
     wheel_radius_right_m: Positive = Field(default=0.10, description="Rolling radius of the right wheel.")
     track_width_m: Positive = Field(default=0.50, description="Distance between the wheels' contact points.")
@@ -68,6 +71,12 @@ class Drive(Section):
     max_wheel_speed_m_s: Positive = Field(
         default=5.0, description="Faster counting is dropped as a fault of the encoder."
     )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Drive:
+        if self.source is not None and self.pose_source is not None:
+            raise ValueError("source and pose_source both say how the robot moves; keep one of them")
+        return self
 
     @field_validator("ticks_per_turn_left", "ticks_per_turn_right")
     @classmethod
@@ -369,7 +378,7 @@ class MaxBotixSonars(_PlainSonars):
         return self
 
 
-_BRIDGE_PORT = "Serial port of the board; its wheels and sonars name the same."
+_BRIDGE_PORT = "Serial port of the board; its wheels, sonars and switches name the same."
 _MAVLINK_PORT = "Serial port, udpin:127.0.0.1:14550 (listens) or udpout:127.0.0.1:14550; its sources name the same."
 
 
@@ -587,3 +596,56 @@ WheelDevice = Annotated[
     Cia406Wheels | ArduinoWheels | RoboClawWheels | ODriveWheels | VescWheels | MavlinkWheels,
     Field(discriminator="driver", description="The encoders of both wheels."),
 ]
+
+
+class Switch(Section):
+    """One bumper or cliff switch: where it covers the robot's border."""
+
+    line: int = Field(ge=0, le=255, description="Its number on the device: a pin.")
+    kind: Literal["bumper", "cliff"] = Field(default="bumper", description="What it feels; both block where they are.")
+    tripped: Literal["low", "high"] = Field(
+        default="high",
+        description="Level of the line when it touches (or sees no floor). high: a switch that opens, with a pull-up, "
+        "so that a broken wire counts as touched.",
+    )
+    x_m: float = Field(default=0.0, description="Middle of what it covers, forward of the base's origin.")
+    y_m: float = Field(default=0.0, description="Left of the base's origin.")
+    yaw_deg: float = Field(default=0.0, ge=-360, le=360, description="Direction it faces.")
+    width_m: float = Field(default=0.2, gt=0, le=10, description="How wide it is.")
+
+
+class ArduinoContacts(Device):
+    """Bumpers and cliff switches at digital pins of a board with the text protocol of ros_arduino_bridge."""
+
+    driver: Literal["arduino-bridge"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description=_BRIDGE_PORT)
+    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed as set in the sketch.")
+    rate_hz: float = Field(default=20.0, gt=0, le=50, description="How often each switch is asked.")
+    hold_s: float = Field(
+        default=0.5, ge=0, le=60, description="How long it counts as touched after it was: contacts bounce."
+    )
+    switches: tuple[Switch, ...] = Field(min_length=1, max_length=32, description="The connected ones.")
+
+    @model_validator(mode="after")
+    def _lines_of_their_own(self) -> ArduinoContacts:
+        lines = [switch.line for switch in self.switches]
+        if len(set(lines)) != len(lines):
+            raise ValueError("two switches have the same line; each has a pin of its own")
+        return self
+
+
+class MavlinkPose(Device):
+    """Where an autopilot's own estimator says the robot is: ODOMETRY. Named by pose_source of [drive]."""
+
+    driver: Literal["mavlink"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description=_MAVLINK_PORT)
+    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed of a serial port.")
+    system: int | None = Field(default=None, ge=1, le=255, description="System id; default: the first that is heard.")
+    rate_hz: float = Field(
+        default=15.0, gt=0, le=200, description="Asked of the autopilot; 57600 bit/s carry 20 at most."
+    )
+
+    @field_validator("port")
+    @classmethod
+    def _reachable(cls, port: str) -> str:
+        return _mavlink_port(port)

@@ -14,7 +14,8 @@ class PolarSectorMap(Section):
     """A polar sector map: per wedge of bearings the nearest obstacle and what is known."""
 
     sources: tuple[Reference, ...] = Field(
-        min_length=1, description="Lasers and sonars that feed it; lasers.NAME or sonars.NAME where both have the name."
+        min_length=1,
+        description="Lasers, sonars and contacts that feed it; lasers.NAME and the like where several have the name.",
     )
     sector_deg: float = Field(default=5.0, gt=0, le=180, description="Width of a sector.")
     start_deg: float = Field(default=-120.0, ge=-360, le=360, description="Where the first sector begins.")
@@ -37,7 +38,8 @@ class RectSectorMap(Section):
     """A rectangular sector map around the robot: per square the nearest obstacle and what is known."""
 
     sources: tuple[Reference, ...] = Field(
-        min_length=1, description="Lasers and sonars that feed it; lasers.NAME or sonars.NAME where both have the name."
+        min_length=1,
+        description="Lasers, sonars and contacts that feed it; lasers.NAME and the like where several have the name.",
     )
     size_m: tuple[Positive, Positive] = Field(
         default=(4.0, 4.0), description="Extent along x and y, centred on the pose."

@@ -17,6 +17,7 @@ from service.health import identity_text, trouble_of
 from service.locks import Claims
 
 _LISTEN_S = 1.0  # so long after the first reading, for a rate
+_OPEN_S = 1.0  # a port that could not be opened until then is not there
 _POLL_S = 0.05
 _STOP_S = 2.0
 
@@ -88,11 +89,15 @@ def check_devices(
 def _wait_for_all(
     readers: list[WireReader[Any]], seconds: float, now_ns: Callable[[], int], sleep: Callable[[float], None]
 ) -> None:
-    """Until every device has been heard for a while, or the time is up."""
-    deadline_ns = now_ns() + int(seconds * 1e9)
+    """Until every device has been heard for a while, or its port cannot be opened, or the time is up."""
+    began_ns = now_ns()
+    deadline_ns = began_ns + int(seconds * 1e9)
     heard_ns: dict[str, int] = {}
     while now_ns() < deadline_ns:
-        sources = [source for reader in readers for source in reader.health().sources.values()]
+        wires = [reader.health() for reader in readers]
+        hopeless = now_ns() - began_ns >= _OPEN_S * 1e9
+        awaited = [wire for wire in wires if not hopeless or wire.is_open or wire.openings]
+        sources = [source for wire in awaited for source in wire.sources.values()]
         for source in sources:
             if source.state is LinkState.RUNNING and source.readings > 0:
                 heard_ns.setdefault(source.name, now_ns())

@@ -13,7 +13,8 @@ Input never stops fusion. What cannot be used is dropped and counted by source a
     range_out_of_bounds    single beams: not positive, or beyond the device's limit; taken as INVALID
     odometry_late, odometry_gone, odometry_broken, waiting_full    a scan that no pose belongs to, for the grids only
     map_refused    a place or a length that a grid cannot hold
-    too_fast    wheel counts that no wheel can have made
+    too_fast, not_a_pose    wheel counts that no wheel can have made, poses nobody can have gone to
+    unconfirmed    a sonar's range much farther than its last, by a protocol without a check sum: the next decides
     unknown_channel, not_configured, wrong_kind    a reading from nowhere
 """
 
@@ -31,8 +32,11 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.readings import (
     AngleReading,
     ChainReading,
+    ContactReading,
+    ContactState,
     DeviceEvent,
     LinkState,
+    PoseReading,
     RangeStatus,
     Reading,
     ScanReading,
@@ -41,13 +45,13 @@ from drivers.readings import (
 from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
 from mapping.kernels import motion
-from mapping.odometry import DifferentialOdometry, DriveGeometry, OdometryState
+from mapping.odometry import DifferentialOdometry, DriveGeometry, FollowedPoses, OdometryState
 from mapping.pose_buffer import GoneError, PoseBuffer
 from mapping.scan import Scan
 from service.align import WaitingRoom
 from service.mounts import TiltingLaser
 from service.outputs import OdomOut, Output, PolarOut, PoseOut, RangesOut, RectOut, ScanOut
-from service.sensors import AxleEncoder, Chain, Laser, Sensor, Wheels
+from service.sensors import AxleEncoder, Chain, Contacts, Laser, PoseSource, Sensor, Switch, Wheels
 
 F64 = NDArray[np.float64]
 
@@ -62,6 +66,8 @@ _POSE_PERIOD_NS = 25_000_000
 _HELD_MAX = 512  # scans and rounds that are held back for a localiser that is late; beyond, fusion waits for it
 _TOO_FAST_IN_A_ROW = 5  # then the counts are believed, and what lay between them is unknown
 _STALE_LIMIT_NS = 500_000_000
+_FARTHEST_POSE_M = 1e7
+_CONFIRMED_M = 0.25  # a robot drives away by less between two readings of a sonar
 SECTOR_MEMORY_NS = _STALE_LIMIT_NS - _SECTOR_PERIOD_NS
 """How long a direction stays fresh without new evidence: what is stale is then published within half a second."""
 
@@ -86,6 +92,15 @@ class Round:
     range_max_m: float
 
 
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """What one switch says: True touched (or no floor), False not, None not known."""
+
+    stamp_ns: int
+    switch: Switch
+    tripped: bool | None
+
+
 class SectorLayer(Protocol):
     """One sector map, polar or rectangular, as fusion sees it. It lets evidence go stale after SECTOR_MEMORY_NS."""
 
@@ -98,6 +113,9 @@ class SectorLayer(Protocol):
 
     def take_round(self, source: str, heard: Round) -> None:
         """The same for sonars; directions that are not in this round keep what they had."""
+
+    def take_touch(self, source: str, touch: Touch) -> None:
+        """The same for a switch."""
 
     def lose(self, source: str) -> None:
         """The source is gone: what it said is stale from now on."""
@@ -118,6 +136,9 @@ class GridLayer(Protocol):
 
     def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
         """Insert the cones of one round."""
+
+    def take_touch(self, source: str, touch: Touch, map_from_base: Pose2) -> None:
+        """Draw what a switch touches; only called for those that are tripped."""
 
     def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
         """What is due for publication at now_ns. map_from_base: where the robot is, None while unknown."""
@@ -225,14 +246,16 @@ def located_by_odometry(map_from_odom: Pose2, state: OdometryState) -> Located:
 class Parts:
     """What fusion is made of.
 
-    drive: name of the source whose counts make odometry, and the geometry to read them by; without one the robot is
-    taken to stand still.  wait_ns: how long a sweep waits for odometry.
+    drive: name of the source whose counts make odometry, and the geometry to read them by.  pose_source: name of
+    another estimator whose poses are used instead; without either the robot is taken to stand still.  wait_ns: how
+    long a sweep waits for odometry.
     """
 
     sensors: Mapping[str, Sensor]
     sectors: Sequence[SectorLayer] = ()
     grids: Sequence[GridLayer] = ()
     drive: tuple[str, DriveGeometry] | None = None
+    pose_source: str | None = None
     max_wheel_speed_m_s: float = 5.0
     localiser: Localiser = field(default_factory=OdometryOnly)
     mounts: Sequence[TiltingLaser] = ()
@@ -247,11 +270,18 @@ class Fusion:
         self._parts = parts
         self.drops: dict[str, dict[str, int]] = {}
         self._last_stamps: dict[str, int] = {}
-        self._waiting: WaitingRoom[Scan | Round] = WaitingRoom(limit_ns=parts.wait_ns)
+        self._waiting: WaitingRoom[Scan | Round | Touch] = WaitingRoom(limit_ns=parts.wait_ns)
         self._chains = {
             sensor.name: _ChainMemory(sensor) for sensor in parts.sensors.values() if isinstance(sensor, Chain)
         }
+        self._contacts = {
+            sensor.name: _ContactMemory(sensor) for sensor in parts.sensors.values() if isinstance(sensor, Contacts)
+        }
         self._odometry = None if parts.drive is None else DifferentialOdometry(parts.drive[1])
+        self._followed = None
+        if parts.pose_source is not None:
+            self._followed = FollowedPoses(max_speed_m_s=parts.max_wheel_speed_m_s)
+        self._moves = self._odometry is not None or self._followed is not None
         self._poses = PoseBuffer(capacity=max(64, int(parts.odometry_memory_s * 250)))
         self._wheels_last: WheelReading | None = None
         self._too_fast = 0
@@ -265,7 +295,7 @@ class Fusion:
         self._late_since_ns: int | None = None
         self._tilting = {mount.settings.laser: mount for mount in parts.mounts}
         self._by_axle = {mount.settings.name: mount for mount in parts.mounts}
-        self._held: deque[tuple[str, Scan | Round]] = deque()  # covered, until the localiser is ready
+        self._held: deque[tuple[str, Scan | Round | Touch]] = deque()  # covered, until the localiser is ready
 
     # --- what comes in
 
@@ -296,6 +326,12 @@ class Fusion:
                 ChainReading(),
             ):  # groups of a chain fire at the same time: its channels have stamps of their own
                 return self._on_round(sensor, item, now_ns)
+            case PoseSource(), PoseReading():
+                newer = self._is_newer(source, item.stamp_ns, now_ns)
+                return self._on_pose(sensor, item, now_ns) if newer else []
+            case Contacts(), ContactReading():
+                newer = self._is_newer(source, item.stamp_ns, now_ns)
+                return self._on_contacts(sensor, item, now_ns) if newer else []
         return self._drop(source, "wrong_kind")
 
     def tick(self, now_ns: int) -> list[Output]:
@@ -327,11 +363,11 @@ class Fusion:
     def troubles(self, now_ns: int) -> list[str]:
         """What fusion waits for or lacks, each in one line with the repair."""
         troubles = self._parts.localiser.troubles()
-        drive = self._parts.drive
-        if drive is None and self._parts.localiser.located() is None and any(g.sources for g in self._parts.grids):
+        motion = self._parts.pose_source or (self._parts.drive and self._parts.drive[0])
+        if motion is None and self._parts.localiser.located() is None and any(g.sources for g in self._parts.grids):
             troubles.append("no [drive] source: the grid is drawn as if the robot stood still")
-        elif drive is not None and self._late_since_ns is not None:
-            troubles.append(f"grids wait for odometry of {drive[0]}: check that device; scans are not drawn meanwhile")
+        elif motion is not None and self._late_since_ns is not None:
+            troubles.append(f"grids wait for odometry of {motion}: check that device; scans are not drawn meanwhile")
         return troubles
 
     def pose(self) -> Pose2 | None:
@@ -463,6 +499,28 @@ class Fusion:
         self._wait_for_poses(chain.name, heard, reading.stamp_ns, reading.stamp_ns, now_ns)
         return outputs
 
+    # --- switches
+
+    def _on_contacts(self, contacts: Contacts, reading: ContactReading, now_ns: int) -> list[Output]:
+        stamp_ns = min(reading.stamp_ns, now_ns)
+        touches, unknown = self._contacts[contacts.name].take(reading, stamp_ns)
+        if unknown:
+            self._drop(contacts.name, "unknown_channel", unknown)
+        if not touches:
+            return []
+        self._fresh_until_ns[contacts.name] = stamp_ns + stale_after_ns(contacts.period_ns, 0)
+        fed = self._fed_by(contacts.name)
+        for index in fed:
+            for touch in touches:
+                self._parts.sectors[index].take_touch(contacts.name, touch)
+        for touch in touches:
+            if touch.tripped:
+                self._wait_for_poses(contacts.name, touch, stamp_ns, stamp_ns, now_ns)
+        if any(touch.tripped for touch in touches):
+            return [self._tell(index, now_ns) for index in fed]
+        self._sectors_untold.update(fed)
+        return []
+
     # --- wheels
 
     def _on_wheels(self, wheels: Wheels, reading: WheelReading, now_ns: int) -> list[Output]:
@@ -476,9 +534,25 @@ class Fusion:
             reading = replace(reading, continuous=False)
         self._too_fast = 0
         self._wheels_last = reading
-        state = self._odometry.update(
-            reading.stamp_ns, reading.left_ticks, reading.right_ticks, continuous=reading.continuous
+        return self._take_state(
+            self._odometry.update(
+                reading.stamp_ns, reading.left_ticks, reading.right_ticks, continuous=reading.continuous
+            )
         )
+
+    def _on_pose(self, poses: PoseSource, reading: PoseReading, now_ns: int) -> list[Output]:
+        """Another estimator's pose in the place of wheel odometry."""
+        if self._followed is None or poses.name != self._parts.pose_source:
+            return []
+        place = (reading.x_m, reading.y_m, reading.yaw_rad)
+        if not all(math.isfinite(value) and abs(value) < _FARTHEST_POSE_M for value in place):
+            return self._drop(poses.name, "not_a_pose")
+        state = self._followed.update(reading.stamp_ns, Pose2(*place), continuous=reading.continuous)
+        if state is None:
+            return self._drop(poses.name, "too_fast")
+        return self._take_state(state)
+
+    def _take_state(self, state: OdometryState) -> list[Output]:
         self._state = state
         self._poses.add(state.stamp_ns, state.odom_from_base, after_break=state.broken)
         self._parts.localiser.take_odometry(state)
@@ -507,7 +581,7 @@ class Fusion:
 
     def _pose_by_scans(self) -> list[Output]:
         """Of a robot without odometry."""
-        located = None if self._odometry is not None else self._parts.localiser.located()
+        located = None if self._moves else self._parts.localiser.located()
         if located is None or located.stamp_ns == self._pose_told_ns:
             return []
         self._pose_told_ns = located.stamp_ns
@@ -515,7 +589,7 @@ class Fusion:
 
     def _map_from_base_now(self) -> Pose2 | None:
         map_from_odom = self._parts.localiser.map_from_odom()
-        if self._odometry is None:
+        if not self._moves:
             return map_from_odom
         return None if self._state is None else map_from_odom @ self._state.odom_from_base
 
@@ -529,7 +603,7 @@ class Fusion:
         if not len(self._waiting):
             self._draw_held(patience=_HELD_MAX)
             return
-        if self._odometry is None:
+        if not self._moves:
             released = self._waiting.release(oldest_ns=-_FOREVER_NS, newest_ns=_FOREVER_NS, now_ns=now_ns)
         else:
             released = self._waiting.release(
@@ -556,7 +630,7 @@ class Fusion:
         """Draw in order, up to a scan that the localiser is not ready for; with more than `patience` it waits there."""
         while self._held:
             source, value = self._held[0]
-            is_ready = isinstance(value, Round) or self._parts.localiser.is_ready(value.stamp_ns)
+            is_ready = isinstance(value, Round | Touch) or self._parts.localiser.is_ready(value.stamp_ns)
             if not is_ready and len(self._held) <= patience:
                 return
             self._held.popleft()
@@ -565,23 +639,26 @@ class Fusion:
             except GoneError:
                 self._drop(source, "odometry_broken")
 
-    def _wait_for_poses(self, source: str, value: Scan | Round, first_ns: int, last_ns: int, now_ns: int) -> None:
+    def _wait_for_poses(
+        self, source: str, value: Scan | Round | Touch, first_ns: int, last_ns: int, now_ns: int
+    ) -> None:
         if any(source in grid.sources for grid in self._parts.grids):
             for lost, reason in self._waiting.put(source, value, first_ns, last_ns, now_ns):
                 self._drop(lost, reason)
 
-    def _draw(self, source: str, value: Scan | Round) -> None:
-        if self._odometry is None:
+    def _draw(self, source: str, value: Scan | Round | Touch) -> None:
+        if not self._moves:
             self._draw_standing(source, value)
         else:
             self._draw_moving(source, value)
 
-    def _draw_moving(self, source: str, value: Scan | Round) -> None:
+    def _draw_moving(self, source: str, value: Scan | Round | Touch) -> None:
         """Raises GoneError if the track is broken under the sweep."""
         localiser = self._parts.localiser
-        if isinstance(value, Round):
+        if isinstance(value, Round | Touch):
             odom_from_base = self._poses.at(value.stamp_ns)
-            localiser.take_round(source, value, odom_from_base)
+            if isinstance(value, Round):
+                localiser.take_round(source, value, odom_from_base)
             self._insert_round(source, value, localiser.map_from_odom() @ odom_from_base)
             return
         base_from_sensor = self._laser(source).base_from_sensor
@@ -590,11 +667,12 @@ class Fusion:
         map_from_base = compose_many(localiser.map_from_odom(), odom_from_bases)
         self._insert_sweep(source, value, carry(map_from_base, base_from_sensor))
 
-    def _draw_standing(self, source: str, value: Scan | Round) -> None:
+    def _draw_standing(self, source: str, value: Scan | Round | Touch) -> None:
         """Without odometry: where the localiser has it, by scans alone."""
         localiser = self._parts.localiser
-        if isinstance(value, Round):
-            localiser.take_round(source, value, IDENTITY)
+        if isinstance(value, Round | Touch):
+            if isinstance(value, Round):
+                localiser.take_round(source, value, IDENTITY)
             self._insert_round(source, value, localiser.map_from_odom())
             return
         base_from_sensor = self._laser(source).base_from_sensor
@@ -615,11 +693,14 @@ class Fusion:
                 except ValueError:  # farther or longer than a grid can hold
                     self._drop(source, "map_refused")
 
-    def _insert_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
+    def _insert_round(self, source: str, heard: Round | Touch, map_from_base: Pose2) -> None:
         for grid in self._parts.grids:
             if source in grid.sources:
                 try:
-                    grid.take_round(source, heard, map_from_base)
+                    if isinstance(heard, Round):
+                        grid.take_round(source, heard, map_from_base)
+                    else:
+                        grid.take_touch(source, heard, map_from_base)
                 except ValueError:
                     self._drop(source, "map_refused")
 
@@ -677,6 +758,8 @@ class _ChainMemory:
         """The chain starts anew: its stamps may too."""
         count = len(self._places)
         self._range_m = [math.nan] * count
+        self._believed_m = [math.nan] * count
+        self._doubted_m = [math.nan] * count
         self._stamp_ns: list[int | None] = [None] * count
         self._interval_ns = float(self._chain.period_ns)
 
@@ -703,9 +786,26 @@ class _ChainMemory:
                 self._interval_ns += 0.2 * (min(reading.stamp_ns - last_ns, SECOND) - self._interval_ns)
             self._stamp_ns[place] = reading.stamp_ns
             range_m = self._range_of(heard.status, heard.range_m) if heard.heard_from is None else math.nan
+            if self._chain.unchecked and self._is_doubtful(place, range_m):
+                refused.append("unconfirmed")
+                range_m = math.nan
             self._range_m[place] = range_m
             cones.append(Cone(heard.channel, self._chain.transducers[place].base_from_transducer, range_m))
         return tuple(cones), refused
+
+    def _is_doubtful(self, place: int, range_m: float) -> bool:
+        """Whether a range is much farther than the last one that was believed, and not yet said twice.
+
+        A wrong near range costs a detour, a wrong far one a bumper.
+        """
+        if math.isnan(range_m):
+            return False
+        doubted_m, self._doubted_m[place] = self._doubted_m[place], range_m
+        confirmed = range_m == doubted_m or abs(range_m - doubted_m) <= _CONFIRMED_M
+        if range_m <= self._believed_m[place] + _CONFIRMED_M or math.isnan(self._believed_m[place]) or confirmed:
+            self._believed_m[place] = range_m
+            return False
+        return True
 
     def _range_of(self, status: RangeStatus, range_m: float) -> float:
         """By the rule of readings.py, within the limits of this chain's transducers."""
@@ -733,6 +833,30 @@ class _ChainMemory:
             chain.range_max_m,
             tuple(range_m if is_fresh else math.nan for range_m, is_fresh in zip(self._range_m, fresh)),
         )
+
+
+class _ContactMemory:
+    """When every switch of a device was last seen tripped: contacts bounce, and a wall stays when a robot backs off."""
+
+    def __init__(self, contacts: Contacts) -> None:
+        self._switches = {switch.line: switch for switch in contacts.switches}
+        self._hold_ns = contacts.hold_ns
+        self._tripped_ns: dict[int, int] = {}
+
+    def take(self, reading: ContactReading, stamp_ns: int) -> tuple[list[Touch], int]:
+        """What the switches of a reading say now, and how many of its lines nobody knows."""
+        touches, unknown = [], 0
+        for heard in reading.lines:
+            switch = self._switches.get(heard.line)
+            if switch is None:
+                unknown += 1
+                continue
+            if heard.state is ContactState.TRIPPED:
+                self._tripped_ns[heard.line] = stamp_ns
+            held = stamp_ns - self._tripped_ns.get(heard.line, -_FOREVER_NS) < self._hold_ns
+            not_tripped = None if heard.state is ContactState.UNKNOWN else False
+            touches.append(Touch(stamp_ns, switch, True if held else not_tripped))
+        return touches, unknown
 
 
 def compose_many(a_from_b: Pose2, b_from_c: F64) -> F64:

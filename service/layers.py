@@ -18,13 +18,15 @@ from mapping.scan import Scan
 from mapping.sectors.artos import ArtosMap
 from mapping.sectors.polar import PolarSectors
 from mapping.sectors.rectangular import RectSectors
-from service.fusion import SECOND, Round
+from service.fusion import SECOND, Round, Touch
 from service.outputs import GridOut, GridUpdateOut, Output, PolarOut, RectOut
 
 F64 = NDArray[np.float64]
 
 _CELLS_A_SECOND = 1_000_000  # a grid of more cells is sent whole less often, and by updates between
 _STILL_M = 1e-3
+_TOUCHED_SURELY = 0.7
+_TOUCHES_MAX = 300  # more than a cell can have been looked through
 _STILL_RAD = 2e-4  # 6 mm at 30 m
 
 
@@ -62,6 +64,20 @@ def insert_round(grid: EvidenceGrid, source: str, heard: Round, map_from_base: P
         )
 
 
+def insert_touch(grid: EvidenceGrid, touch: Touch, map_from_base: Pose2) -> None:
+    """Draw what a switch touches as occupied, however often others have looked through it: glass is felt, not seen."""
+    count = max(2, math.ceil(touch.switch.width_m / (0.5 * grid.resolution_m)) + 1)
+    across = np.linspace(-0.5 * touch.switch.width_m, 0.5 * touch.switch.width_m, count)
+    ahead = np.full(count, 0.5 * grid.resolution_m)
+    line = (map_from_base @ touch.switch.base_from_contact).apply(np.stack((ahead, across), axis=-1))
+    cells = np.array([grid.cell_at(float(x), float(y)) for x, y in line], dtype=np.int64)
+    nothing = np.empty((0, 2), dtype=np.int64)
+    for _ in range(_TOUCHES_MAX):
+        grid.insert_cells(np.unique(cells, axis=0), nothing)
+        if (grid.probability_at(line) > _TOUCHED_SURELY).all():
+            break
+
+
 class PolarLayer:
     """A polar sector map."""
 
@@ -75,6 +91,9 @@ class PolarLayer:
 
     def take_round(self, source: str, heard: Round) -> None:
         feed_round(self.sectors, source, heard)
+
+    def take_touch(self, source: str, touch: Touch) -> None:
+        feed_touch(self.sectors, source, touch)
 
     def lose(self, source: str) -> None:
         self.sectors.lost(source)
@@ -96,6 +115,9 @@ class RectLayer:
 
     def take_round(self, source: str, heard: Round) -> None:
         feed_round(self.sectors, source, heard)
+
+    def take_touch(self, source: str, touch: Touch) -> None:
+        feed_touch(self.sectors, source, touch)
 
     def lose(self, source: str) -> None:
         self.sectors.lost(source)
@@ -132,6 +154,18 @@ def feed_round(sectors: PolarSectors | RectSectors, source: str, heard: Round) -
         )
 
 
+def feed_touch(sectors: PolarSectors | RectSectors, source: str, touch: Touch) -> None:
+    """Hand what a switch says to a sector map."""
+    sectors.update_contact(
+        source,
+        touch.switch.line,
+        base_from_contact=touch.switch.base_from_contact,
+        width_m=touch.switch.width_m,
+        tripped=touch.tripped,
+        stamp_ns=touch.stamp_ns,
+    )
+
+
 class BuildingLayer:
     """The map-fixed grid: sent whole when it has grown or after a while, by changed rectangles between."""
 
@@ -154,6 +188,9 @@ class BuildingLayer:
 
     def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
         insert_round(self.grid, source, heard, map_from_base)
+
+    def take_touch(self, source: str, touch: Touch, map_from_base: Pose2) -> None:
+        insert_touch(self.grid, touch, map_from_base)
 
     def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
         if self._full is not None and now_ns - self._update_ns < self._update_period_ns:
@@ -223,6 +260,11 @@ class RollingLayer:
         self.grid.clear()
         self._changed = True
 
+    def take_touch(self, source: str, touch: Touch, map_from_base: Pose2) -> None:
+        self.grid.centre_on(map_from_base.x_m, map_from_base.y_m)
+        insert_touch(self.grid, touch, map_from_base)
+        self._changed = True
+
     def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
         if not self._changed or (self._told_ns is not None and now_ns - self._told_ns < self._period_ns):
             return []
@@ -251,6 +293,9 @@ class ArtosLayer:
         raise AssertionError("the two-step map is drawn from sector maps")
 
     def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
+        raise AssertionError("the two-step map is drawn from sector maps")
+
+    def take_touch(self, source: str, touch: Touch, map_from_base: Pose2) -> None:
         raise AssertionError("the two-step map is drawn from sector maps")
 
     def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:

@@ -26,7 +26,7 @@ from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service.errors import Trouble
-from service.fusion import Round
+from service.fusion import Round, Touch
 from service.outputs import CloudOut, GridOut, GridUpdateOut, Output, PoseOut
 
 log = logging.getLogger(__name__)
@@ -334,6 +334,9 @@ class SweepTap:
 
     def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
         """Cones go into grids only."""
+
+    def take_touch(self, source: str, touch: Touch, map_from_base: Pose2) -> None:
+        """So does what switches touch."""
 
     def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
         return []

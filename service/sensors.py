@@ -34,7 +34,10 @@ class Transducer:
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """Sonars fired in turn. cone_rad: full opening angle.  period_ns: from one round to the next, as configured."""
+    """Sonars fired in turn. cone_rad: full opening angle.  period_ns: from one round to the next, as configured.
+
+    unchecked: its protocol has no check sum, so that a damaged value may pass for a true one.
+    """
 
     name: str
     transducers: tuple[Transducer, ...]
@@ -42,6 +45,7 @@ class Chain:
     range_min_m: float
     range_max_m: float
     period_ns: int = 100_000_000
+    unchecked: bool = False
 
     kind = "sonar"
 
@@ -64,4 +68,37 @@ class AxleEncoder:
     kind = "mount"
 
 
-Sensor = Laser | Chain | Wheels | AxleEncoder
+@dataclass(frozen=True, slots=True)
+class Switch:
+    """A bumper or cliff switch. line: its number on the device.  base_from_contact: its middle, looking outwards.
+
+    width_m: how much of the robot's border it covers.
+    """
+
+    line: int
+    base_from_contact: Pose2
+    width_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Contacts:
+    """The switches of one device. hold_ns: how long one counts as tripped after it was last seen so."""
+
+    name: str
+    switches: tuple[Switch, ...]
+    period_ns: int = 50_000_000
+    hold_ns: int = 500_000_000
+
+    kind = "contacts"
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSource:
+    """Another estimator that says where the robot is."""
+
+    name: str
+
+    kind = "poses"
+
+
+Sensor = Laser | Chain | Wheels | AxleEncoder | Contacts | PoseSource

@@ -267,12 +267,19 @@ class TcpLink:
 
 
 class MemoryLink:
-    """A wire inside one process, for tests: `host_write` and `host_read` are the other end."""
+    """A wire inside one process, for tests: `host_write` and `host_read` are the other end.
 
-    def __init__(self, baud: int | None = None) -> None:
+    path: the name it has in configurations.  is_denied, is_busy: why a host could not open it now.
+    """
+
+    def __init__(self, baud: int | None = None, path: Path | str = "memory") -> None:
+        self.path = Path(path)
         self.counters = LinkCounters()
         self.baud = baud
         self.is_open = True
+        self.is_busy = self.is_denied = False
+        self.pulled = 0  # how often it was closed: a host that had it open has lost it
+        self._name = self.path.name
         self._to_device = bytearray()
         self._to_host = bytearray()
 
@@ -281,8 +288,19 @@ class MemoryLink:
 
     def close(self) -> None:
         self.is_open = False
+        self.pulled += 1
         self._to_device.clear()
         self._to_host.clear()
+
+    def rename(self, suffix: str) -> None:
+        """Come back under the first name with a suffix; whoever had it open has lost it."""
+        if self.path.name != self._name + suffix:
+            self.close()
+            self.path = self.path.with_name(self._name + suffix)
+
+    def obstruct(self, *, busy: bool, denied: bool) -> None:
+        """See PtyLink."""
+        self.is_busy, self.is_denied = busy, denied
 
     def files(self) -> list[int]:
         return []
@@ -332,6 +350,36 @@ class Station(Protocol):
         """Give back what it holds."""
 
 
+class PortOf:
+    """Keeps a link as its device wants it: plugged in or not, under which name, busy or not permitted."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._obstructed = (False, False)
+
+    def follow(self, device: object, wanted: bool) -> bool:
+        """Do what the device's attributes say (see DeviceStation); returns whether the plug was pulled just now."""
+        wanted = wanted and bool(getattr(device, "plugged", True))
+        link, was_open = self._link, self._link.is_open
+        if isinstance(link, PtyLink | MemoryLink):
+            link.rename(str(getattr(device, "port_suffix", "")))
+        was_pulled = was_open and not (wanted and link.is_open)
+        if wanted and not link.is_open:
+            link.open()
+            self._obstructed = (False, False)
+        elif not wanted and link.is_open:
+            link.close()
+        self._obstruct(bool(getattr(device, "port_busy", False)), bool(getattr(device, "port_denied", False)))
+        return was_pulled
+
+    def _obstruct(self, busy: bool, denied: bool) -> None:
+        link = self._link
+        if (busy, denied) != self._obstructed and isinstance(link, PtyLink | MemoryLink) and link.is_open:
+            with contextlib.suppress(BlockingIOError):  # a host holds it: try again at the next service
+                link.obstruct(busy=busy, denied=denied)
+                self._obstructed = busy, denied
+
+
 class DeviceStation:
     """One serial or TCP device on its link.
 
@@ -345,7 +393,7 @@ class DeviceStation:
         self.link = link
         self._wanted = True
         self._hosts_lost = 0
-        self._obstructed = (False, False)
+        self._port = PortOf(link)
 
     def files(self) -> list[int]:
         return self.link.files()
@@ -368,22 +416,7 @@ class DeviceStation:
         self.link.close()
 
     def _follow_plug(self) -> None:
-        wanted = self._wanted and bool(getattr(self.device, "plugged", True))
-        if isinstance(self.link, PtyLink):
-            self.link.rename(str(getattr(self.device, "port_suffix", "")))
-        if wanted and not self.link.is_open:
-            self.link.open()
-            self._obstructed = (False, False)
-        elif not wanted and self.link.is_open:
-            self.link.close()
-        self._follow_obstruction()
-
-    def _follow_obstruction(self) -> None:
-        state = bool(getattr(self.device, "port_busy", False)), bool(getattr(self.device, "port_denied", False))
-        if state != self._obstructed and isinstance(self.link, PtyLink) and self.link.is_open:
-            with contextlib.suppress(BlockingIOError):  # a host holds it: try again at the next service
-                self.link.obstruct(busy=state[0], denied=state[1])
-                self._obstructed = state
+        self._port.follow(self.device, self._wanted)
 
     def _tell_loss(self, now_ns: int) -> None:
         lost = int(getattr(self.link, "hosts_lost", 0))

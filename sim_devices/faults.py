@@ -473,7 +473,8 @@ def _glass(range_m: F64, fault: Fault, sight: Sight) -> F64:
 
 
 def _black(range_m: F64, fault: Fault, sight: Sight) -> F64:
-    range_m[sight.sector(fault)] = np.inf
+    """Too little light comes back to measure by; a device that can tells so, others say what they say of nothing."""
+    range_m[sight.sector(fault) & np.isfinite(range_m)] = np.nan
     return range_m
 
 

@@ -29,8 +29,9 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sim_devices.device import F64, Mount, Scene
 from sim_devices.ranging import garbled
-from sim_devices.wire import SECOND_NS, PacedWire
+from sim_devices.wire import BITS_PER_BYTE, SECOND_NS, PacedWire
 
+TX_BUFFER = 512  # bytes
 BINS = 72
 BIN_DEG = 360.0 / BINS
 FORGET_NS = SECOND_NS // 2
@@ -202,10 +203,16 @@ class MavlinkAutopilot:
         """All messages whose time has come, in the order of their times; what was slept over is left out."""
         due = sorted((s for s in self._streams if s.interval_ns and s.next_ns <= now_ns), key=lambda s: s.next_ns)
         for stream in due:
-            for message in stream.build(now_ns):
+            for message in () if self._is_line_full(now_ns) else stream.build(now_ns):
                 self._say(message, now_ns)
             missed = (now_ns - stream.next_ns) // stream.interval_ns
             stream.next_ns += (missed + 1) * stream.interval_ns
+
+    def _is_line_full(self, now_ns: int) -> bool:
+        """An autopilot sends nothing that its transmit buffer has no room for."""
+        if self._wire is None:
+            return False
+        return self._wire.free_ns - now_ns > TX_BUFFER * BITS_PER_BYTE * SECOND_NS // self._wire.rate_bps
 
     def _heartbeat(self, now_ns: int) -> list[Any]:
         autopilot = mavlink.MAV_AUTOPILOT_PX4 if self.kind == "px4" else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sim_devices.attach import Attachment, PtyLink, TcpLink
+from sim_devices.attach import Attachment, MemoryLink, PtyLink, TcpLink
+from sim_devices.contact import Bumper, Cliff, Contact
 from sim_devices.device import ByteDevice, CanDevice, Mount, Scene
-from sim_devices.encoder_arduino_bridge import ArduinoBridge, Sonar
+from sim_devices.encoder_arduino_bridge import ArduinoBridge, Pin, Sonar
 from sim_devices.encoder_cia406 import Cia406Encoder
 from sim_devices.encoder_odrive import ODriveAxis
 from sim_devices.encoder_roboclaw import RoboClaw
@@ -64,7 +65,7 @@ class Robot:
     """
 
     config: Table
-    links: dict[str, PtyLink | TcpLink | UdpLink] = field(default_factory=dict)
+    links: dict[str, PtyLink | TcpLink | UdpLink | MemoryLink] = field(default_factory=dict)
     buses: dict[str, CanBusStation] = field(default_factory=dict)
     lasers: dict[str, ByteDevice] = field(default_factory=dict)
     sonars: dict[str, UsBoard] = field(default_factory=dict)
@@ -87,17 +88,19 @@ def emulate(
     exact: bool = False,
     seed: int = 0,
     plan: FaultPlan | None = None,
+    in_memory: bool = False,
 ) -> Robot:
     """Attach an emulated device for each device of a configuration, and say where.
 
     folder: where the ptys' links stand.  laser: model of all lasers, whatever the configuration says; default: the
     first of each laser's driver.  profile: of a Hokuyo that is no model.  exact: no noise on lasers (recorded ranges
-    have theirs).  plan: faults; its targets are laser.NAME, sonar.NAME, encoder.left and .right, bus.NAME, and
-    adapter.NAME, the daemon's port on that bus; mount.NAME, the encoder of a mount; autopilot, or autopilot.1, .2 if
-    there are several.  Raises PresetError for a device that cannot be emulated.
+    have theirs).  plan: faults; its targets are laser.NAME, sonar.NAME, contact.NAME.LINE, encoder.left and
+    .right, bus.NAME, and adapter.NAME, the daemon's port on that bus; mount.NAME, the encoder of a mount; autopilot, or
+    autopilot.1, .2 if there are several.  in_memory: wires within this process instead of ptys and sockets, under the
+    same names.  Raises PresetError for a device that cannot be emulated.
     """
     robot = Robot(copy.deepcopy(dict(config)))
-    builder = _Builder(robot, scene, attachment, folder, plan or FaultPlan(seed=seed), faulty=plan is not None)
+    builder = _Builder(robot, scene, attachment, folder, plan or FaultPlan(seed=seed), plan is not None, in_memory)
     for name, bus in robot.config.get("can", {}).items():
         builder.add_bus(name, bus)
     for k, (name, table) in enumerate(sorted(robot.config.get("lasers", {}).items())):
@@ -126,11 +129,12 @@ class _Builder:
     folder: Path
     plan: FaultPlan
     faulty: bool
+    in_memory: bool
 
     def add_bus(self, name: str, bus: Table) -> None:
         can = CanBus(bitrate_bps=int(bus.get("bitrate_bps", 1000000)))
         station = CanBusStation(can)
-        link = PtyLink(self.folder / f"can-{name}")
+        link = self._line(f"can-{name}")
         adapter = station.add_member(HOST, link)
         if self.faulty:
             station.wrap_member(HOST, self.plan.device(f"adapter.{name}", adapter))
@@ -169,10 +173,13 @@ class _Builder:
             profile=profile,
             on_tcp=on_tcp,
         )
-        link = TcpLink(0) if on_tcp else PtyLink(self.folder / f"laser-{name}")
+        link = TcpLink(0) if on_tcp and not self.in_memory else self._line(f"laser-{name}")
         self.attachment.add(f"lasers.{name}", self.plan.device(target, device) if self.faulty else device, link)
         self.robot.lasers[name], self.robot.links[f"lasers.{name}"] = device, link
-        laser["port"] = str(link.path) if isinstance(link, PtyLink) else f"tcp://{link.host}:{link.port}"
+        if isinstance(link, TcpLink):
+            laser["port"] = f"tcp://{link.host}:{link.port}"
+        elif not on_tcp:
+            laser["port"] = str(link.path)
 
     def add_sonar(self, name: str, sonar: Table, *, seed: int) -> None:
         driver = _required(sonar, f"sonars.{name}", SONAR_DRIVERS)
@@ -224,26 +231,44 @@ class _Builder:
         tables = [table for _, _, table in members]
         wheels = [name for section, name, _ in members if section == "wheels"]
         sonars = [name for section, name, _ in members if section == "sonars"]
-        if len(wheels) > 1 or len(sonars) > 1:
-            raise PresetError(f"{port}: a board has one pair of wheels and one set of sonars")
+        contacts = [name for section, name, _ in members if section == "contacts"]
+        if max(len(wheels), len(sonars), len(contacts)) > 1:
+            raise PresetError(f"{port}: a board has one pair of wheels, one set of sonars and one of switches")
         pins = {
             pin: Sonar(mount, _half_cone_rad(table), range_max_m=float(table.get("range_max_m", 3.0)))
             for table in tables
             for pin, mount in _transducer_mounts(table).items()
         }
-        target = self._wheels_target(wheels[0]) if wheels else f"sonar.{sonars[0]}"
+        own = f"sonar.{sonars[0]}" if sonars else f"contact.{contacts[0]}" if contacts else ""
+        target = self._wheels_target(wheels[0]) if wheels else own
         pair = self._wheel_pair(self._seen(target)) if wheels else (None, None)
-        board = ArduinoBridge(*pair, sonars=pins, baud_bps=int(tables[0].get("baud_bps", 57600)))
+        switches = self._switches(contacts[0]) if contacts else {}
+        baud_bps = int(tables[0].get("baud_bps", 57600))
+        board = ArduinoBridge(*pair, sonars=pins, pins=switches, baud_bps=baud_bps)
         if sonars:
             board.see(self._seen(f"sonar.{sonars[0]}"))
-        place = f"wheels.{wheels[0]}" if wheels else f"sonars.{sonars[0]}"
+        section, name = next((section, name) for section, name, _ in sorted(members, key=_first_wheels))
+        place = f"{section}.{name}"
         self._attach_serial(place, place.replace(".", "-"), tables, target, board)
+
+    def _switches(self, name: str) -> dict[int, Pin]:
+        """Lines of bumpers that feel this scene, and of cliff switches above its floor."""
+        lines: dict[int, Pin] = {}
+        for each in self.robot.config["contacts"][name]["switches"]:
+            line, mount = int(each["line"]), _mount(each)
+            target = f"contact.{name}.{line}"
+            is_cliff = each.get("kind") == "cliff"
+            scene = self._seen(target)
+            touch = Cliff(scene, mount) if is_cliff else Bumper(scene, mount, width_m=float(each.get("width_m", 0.2)))
+            contact = Contact(touch, normally_closed=each.get("tripped", "high") == "high", seed=line)
+            lines[line] = (self.plan.contact(target, contact) if self.faulty else contact).level
+        return lines
 
     def _members(self, driver: str) -> list[tuple[str, str, Table]]:
         """Section, name and table of everything that hangs on boards with this driver."""
         return [
             (section, name, table)
-            for section in ("wheels", "sonars")
+            for section in ("wheels", "sonars", "contacts", "poses")
             for name, table in self.robot.config.get(section, {}).items()
             if table.get("driver") == driver
         ]
@@ -292,8 +317,12 @@ class _Builder:
         if not on_udp:
             self._attach_serial(target, target.replace(".", "-"), tables, target, pilot)
             return
-        link = UdpLink(int(port.rpartition(":")[2]) if port.startswith("udpin") else None)
-        if port.startswith("udpout"):
+        link: UdpLink | MemoryLink
+        if self.in_memory:
+            link = MemoryLink(path=self.folder / target)
+        else:
+            link = UdpLink(int(port.rpartition(":")[2]) if port.startswith("udpin") else None)
+        if port.startswith("udpout") and isinstance(link, UdpLink):
             for table in tables:
                 table["port"] = f"udpout:{link.host}:{link.port}"
         self.attachment.add(target, self.plan.device(target, pilot) if self.faulty else pilot, link)
@@ -357,11 +386,16 @@ class _Builder:
 
     def _attach_serial(self, station: str, file: str, tables: list[Table], target: str, device: ByteDevice) -> None:
         """Put a device on a pty of its own and its name into the configuration."""
-        link = PtyLink(self.folder / file)
+        link = self._line(file)
         self.attachment.add(station, self.plan.device(target, device) if self.faulty else device, link)
         self.robot.links[station] = link
         for table in tables:
             table["port"] = str(link.path)
+
+    def _line(self, file: str) -> PtyLink | MemoryLink:
+        """A serial line under a name of its own."""
+        path = self.folder / file
+        return MemoryLink(path=path) if self.in_memory else PtyLink(path)
 
     def _seen(self, target: str, scene: Scene | None = None) -> Scene:
         scene = scene or self.scene
@@ -408,6 +442,10 @@ class _Builder:
 
     def _join(self, bus: CanBus, target: str, node: CanDevice) -> None:
         bus.add_node(target, self.plan.node(target, node) if self.faulty else node)
+
+
+def _first_wheels(member: tuple[str, str, Table]) -> int:
+    return ("wheels", "sonars", "contacts", "poses").index(member[0])
 
 
 def _bus_of(robot: Robot, device: Table, place: str) -> CanBus:

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from sim_devices.attach import STEP_NS, Link
+from sim_devices.attach import STEP_NS, Link, PortOf
 from sim_devices.device import ByteDevice, CanDevice, Frame
 from sim_devices.wire import SECOND_NS
 
@@ -358,6 +358,7 @@ class _Member:
         self.device = device
         self.link = link
         self.wanted = True
+        self._port = PortOf(link)
         self._rest = b""
         self._out = b""
 
@@ -382,11 +383,7 @@ class _Member:
             self.adapter.note_overrun(lost.count(CR) + lost.count(BEL))
 
     def _follow_plug(self, now_ns: int) -> None:
-        wanted = self.wanted and self.adapter.plugged and bool(getattr(self.device, "plugged", True))
-        if wanted and not self.link.is_open:
-            self.link.open()
-        elif not wanted and self.link.is_open:
-            self.link.close()
+        if self._port.follow(self.device, self.wanted and self.adapter.plugged):
             self.adapter.power_on(now_ns)
             self._rest = self._out = b""
 

@@ -135,6 +135,10 @@ class Evidence:
         if (at, channel) not in self._channels:
             self.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
 
+    def doubt(self, source: str, channel: int) -> None:
+        """What this channel said is stale from now on, until it speaks again."""
+        self._channels[self.index(source), channel].dead = True
+
     def lost(self, source: str) -> None:
         """The device is gone: all it said is stale from now on, until each channel speaks again."""
         at = self.index(source)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +15,8 @@ from mapping.sectors.sight import Sight, arc_of_cone, end_points, median_spacing
 F64 = NDArray[np.float64]
 
 _BYTES_REMEMBERED = 4 << 20
+_TOUCH_STEP_M = 0.02
+_SCANS_REMEMBERED = 40  # four seconds of a slow scanner
 
 
 def cones_remembered(sectors: int) -> int:
@@ -26,28 +29,31 @@ def cones_remembered(sectors: int) -> int:
 
 
 class SpacingMemory:
-    """The finest spacing of beams each source has shown: a scan that lost every other beam must not pass for whole."""
+    """The finest spacing of beams each source has shown lately: a scan that lost every other beam must not pass for
+    whole. Lately, because a head that still gathers speed measures more finely than it ever will again.
+    """
 
     def __init__(self) -> None:
-        self._finest: dict[str, float] = {}
+        self._lately: dict[str, deque[float]] = {}
         self._last: dict[str, F64] = {}
 
     def of(self, source: str, bearing_rad: F64, spacing_rad: float | None) -> float:
         """The spacing to judge gaps by; spacing_rad is the device's own figure, if it is known."""
         if spacing_rad is not None:
             return spacing_rad
-        known = self._finest.get(source)
-        if known is not None and np.array_equal(self._last[source], bearing_rad):
-            return known  # the usual case: the same directions as the last time
+        lately = self._lately.setdefault(source, deque(maxlen=_SCANS_REMEMBERED))
+        if lately and np.array_equal(self._last[source], bearing_rad):
+            lately.append(lately[-1])  # the usual case: the same directions as the last time
+            return min(lately)
         median = median_spacing(bearing_rad)
-        self._last[source] = bearing_rad.copy()
-        if median is not None and median > 0.0 and (known is None or median < known):
-            known = self._finest[source] = median
-        return known if known is not None else 0.0
+        if median is not None and median > 0.0:
+            self._last[source] = bearing_rad.copy()
+            lately.append(median)
+        return min(lately, default=0.0)
 
     def forget(self, source: str) -> None:
         """The device is gone; what answers next may be set differently."""
-        self._finest.pop(source, None)
+        self._lately.pop(source, None)
         self._last.pop(source, None)
 
 
@@ -119,3 +125,10 @@ def see_cone(
         return sight, np.empty((0, 2)), np.empty(0)
     arc, off_axis = arc_of_cone(cone_rad=cone_rad, range_m=echo_m, virtual_from_transducer=virtual_from_transducer)
     return sight, arc, off_axis
+
+
+def touched_line(virtual_from_contact: Pose2, width_m: float) -> F64:
+    """(M, 2) points along a bumper or a cliff sensor, from its right end to its left, virtual sensor frame."""
+    count = max(2, math.ceil(width_m / _TOUCH_STEP_M) + 1)
+    across = np.linspace(-0.5 * width_m, 0.5 * width_m, count)
+    return virtual_from_contact.apply(np.stack((np.zeros(count), across), axis=-1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +13,15 @@ from mapping.frames import IDENTITY, Pose2
 from mapping.kernels import sectors as kernels
 from mapping.sectors.evidence import Evidence, Finding
 from mapping.sectors.footprint import Outline, checked_polygon
-from mapping.sectors.inputs import SpacingMemory, checked_beams, cones_remembered, see_beams, see_cone, without_self
+from mapping.sectors.inputs import (
+    SpacingMemory,
+    checked_beams,
+    cones_remembered,
+    see_beams,
+    see_cone,
+    touched_line,
+    without_self,
+)
 from mapping.sectors.sight import Sight, arc_of_cone
 from mapping.sectors.snapshot import PolarSnapshot, SectorState
 
@@ -74,6 +83,7 @@ class PolarSectors:
         self._footprint = checked_polygon(footprint) if footprint is not None and self_filter else None
         self._frame = _Wedges(self.edges_rad, sector_rad, range_max_m, self._outline)
         self._spacing = SpacingMemory()
+        self._contacts: dict[tuple[str, int], tuple[Finding, int]] = {}  # what each would say if it were touched
         self._heard = lru_cache(cones_remembered(len(self.edges_rad) - 1))(self._find_in_cone)
         self._evidence = Evidence(
             count=len(self.edges_rad) - 1,
@@ -166,8 +176,38 @@ class PolarSectors:
         free_m[~self._frame.ends_in_cone(free_m, cone_rad, pose)] = 0.0
         return Finding(nearest_m, at_rad, at_rad, free_m, np.zeros(len(free_m), dtype=bool))
 
+    def update_contact(
+        self,
+        source: str,
+        channel: int,
+        *,
+        base_from_contact: Pose2,
+        width_m: float,
+        tripped: bool | None,
+        stamp_ns: int,
+    ) -> None:
+        """Take a bumper or cliff switch. tripped: an obstacle along it; not tripped: nothing, it frees no sector.
+
+        None: it does not answer; its sectors are stale, as they are once the source is lost. base_from_contact: its
+        middle, looking outwards.  width_m: its length across.  Raises ValueError for an unknown source.
+        """
+        self._evidence.index(source)
+        line = touched_line(self._virtual_from_base @ base_from_contact, width_m)
+        count = len(self.edges_rad) - 1
+        nowhere = np.full(count, np.nan)
+        clear = Finding(np.full(count, np.inf), nowhere, nowhere, np.zeros(count), np.zeros(count, dtype=bool))
+        nearest_m, at_rad = self._frame.nearest(line)
+        touched = replace(clear, obstacle_m=nearest_m, u=at_rad, v=at_rad)
+        self._contacts[source, channel] = (touched, stamp_ns)
+        self._evidence.revise(source, channel, clear if tripped is False else touched, stamp_ns=stamp_ns, looked=None)
+        if tripped is None:
+            self._evidence.doubt(source, channel)
+
     def lost(self, source: str) -> None:
         """The device is gone: its evidence is stale now, not only when its time is up."""
+        for (owner, channel), (touched, stamp_ns) in self._contacts.items():
+            if owner == source:  # nobody knows any more whether it is touched
+                self._evidence.revise(source, channel, touched, stamp_ns=stamp_ns, looked=None)
         self._evidence.lost(source)
         self._spacing.forget(source)
 

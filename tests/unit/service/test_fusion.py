@@ -23,7 +23,7 @@ from mapping.frames import IDENTITY, Pose2
 from mapping.odometry import DriveGeometry
 from mapping.scan import Scan
 from mapping.sectors.snapshot import PolarSnapshot
-from service.fusion import Fusion, Parts, Round, carry, compose_many, stale_after_ns
+from service.fusion import Fusion, Parts, Round, Touch, carry, compose_many, stale_after_ns
 from service.outputs import OdomOut, Output, PolarOut, PoseOut, RangesOut, ScanOut
 from service.sensors import Chain, Laser, Transducer, Wheels
 
@@ -58,6 +58,9 @@ class SectorDiary:
     def take_scan(self, source: str, scan: Scan, base_from_sensor: Pose2) -> None:
         self.scans.append((scan, base_from_sensor))
         self.state = 1
+
+    def take_touch(self, source: str, touch: Touch) -> None:
+        raise AssertionError("no switch feeds it")
 
     def take_round(self, source: str, heard: Round) -> None:
         self.rounds.append(heard)
@@ -94,6 +97,9 @@ class GridDiary:
 
     def take_sweep(self, source: str, scan: Scan, map_from_sensor: NDArray[np.float64]) -> None:
         self.sweeps.append((source, scan, np.atleast_2d(map_from_sensor)))
+
+    def take_touch(self, source: str, touch: Touch, map_from_base: Pose2) -> None:
+        raise AssertionError("no switch draws it")
 
     def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
         self.rounds.append((heard, map_from_base))

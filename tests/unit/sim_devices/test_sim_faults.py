@@ -303,7 +303,7 @@ def test_sectors() -> None:
     lost = seen("laser:lost_sector(from_deg=-10, to_deg=20)")
     assert np.array_equal(np.isnan(lost), (np.degrees(BEARINGS) >= -10.001) & (np.degrees(BEARINGS) <= 20.001))
     black = seen("laser:black(from_deg=60, to_deg=-60)")
-    assert np.array_equal(np.isinf(black), np.abs(np.degrees(BEARINGS)) > 59.999)
+    assert np.array_equal(np.isnan(black), np.abs(np.degrees(BEARINGS)) > 59.999)
     assert np.array_equal(seen("laser:ghost=0.4(from_deg=-90, to_deg=90)"), np.full(181, 0.4))
 
 
