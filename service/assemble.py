@@ -62,7 +62,7 @@ from service.config_devices import (
     VescWheels,
     tcp_address,
 )
-from service.fusion import SECTOR_MEMORY_NS, Fusion, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer
+from service.fusion import SECTOR_MEMORY_NS, Fusion, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer, StoredTile
 from service.mounts import MountSettings, TiltingLaser
 from service.sensors import (
     AxleEncoder,
@@ -644,10 +644,12 @@ def localiser(
     start_pose: Pose2,
     submit: Submit,
     on_redrawn: OnRedrawn | None = None,
+    stored: Sequence[StoredTile] = (),
 ) -> Localiser:
     """What says where the odom frame lies in the map; the same for a daemon and for a replay of what it recorded.
 
-    submit: where slow work is done.  on_redrawn: see Redrawer.
+    submit: where slow work is done.  on_redrawn: see Redrawer.  stored: the layer `slam` of the map
+    that was taken up.
     """
     lasers = {
         name: sensor.base_from_sensor
@@ -658,13 +660,14 @@ def localiser(
     if not config.slam.enabled or not matched:
         return OdometryOnly(start_pose)
     from service.redraw import Redrawer
-    from service.slam_live import SlamLocaliser
+    from service.slam_live import SlamLocaliser, stored_or_none
 
     redrawer = Redrawer(made.grids, made.building, lasers, submit=submit)
-    if made.building is not None:
+    kept = stored_or_none(stored)
+    if made.building is not None and kept is None:
         redrawer.start_over(made.building.grid.tiles())
     redrawer.on_redrawn = on_redrawn or redrawer.on_redrawn
-    return SlamLocaliser(matched, start=start_pose, submit=submit, redrawer=redrawer)
+    return SlamLocaliser(matched, start=start_pose, submit=submit, redrawer=redrawer, stored=kept)
 
 
 def geometry_of(drive: Drive) -> DriveGeometry:

@@ -37,7 +37,7 @@ from service.background import Background
 from service.clock import Clock, SystemClock
 from service.config import Config, Loaded
 from service.errors import Trouble
-from service.live_map import LiveMap, restore
+from service.live_map import SLAM, LiveMap, restore
 from service.locks import Claims
 from service.map_makers import MapMakers, SweepTap
 from service.outputs import HealthOut, Output
@@ -128,9 +128,11 @@ class Daemon:
         start_pose = None if store is None or maps.building is None else restore(maps.building.grid, store)
         if start_pose is not None and store is not None and store.layers().get("grid"):
             log.warning(
-                "the map goes on where it was left, with the robot at x %.2f m y %.2f m yaw %.0f deg: "
-                "if it was moved since, start with another [store] path or load a map",
+                "the map goes on where it was left, with the robot at x %.2f m y %.2f m yaw %.0f deg: %s",
                 start_pose.x_m, start_pose.y_m, math.degrees(start_pose.yaw_rad),
+                "it is looked for there, then everywhere, before anything is drawn"
+                if config.slam.enabled and store.layers().get(SLAM)
+                else "if it was moved since, start with another [store] path or load a map",
             )  # fmt: skip
         self._publisher = self._make_publisher()
         self._parts.callback(self._close_publisher)
@@ -148,8 +150,15 @@ class Daemon:
             self._makers.restore(store.load_tiles)
         background = Background()
         self._parts.callback(self._stop_background, background)
+        self._stored_slam = () if store is None else tuple(store.load_tiles(SLAM))
         localiser = assemble.localiser(
-            config, self._sensors, maps, start_pose or IDENTITY, background.submit, self._makers.redraw
+            config,
+            self._sensors,
+            maps,
+            start_pose or IDENTITY,
+            background.submit,
+            self._makers.redraw,
+            self._stored_slam,
         )
         parts = assemble.parts(config, self._sensors, maps, localiser)
         if sources := self._makers.sources:
@@ -272,6 +281,7 @@ class Daemon:
             (map_from_odom.x_m, map_from_odom.y_m, map_from_odom.yaw_rad),
             complete,
             tiles,
+            self._stored_slam if complete else (),
         )
         path = self._recorder.begin(start, published=published)
         log.info("recording to %s", path)

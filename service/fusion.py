@@ -22,9 +22,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +54,7 @@ from service.outputs import OdomOut, Output, PolarOut, PoseOut, RangesOut, RectO
 from service.sensors import AxleEncoder, Chain, Contacts, Laser, PoseSource, Sensor, Switch, Wheels
 
 F64 = NDArray[np.float64]
+StoredTile = tuple[int, int, bytes]
 
 SECOND = 1_000_000_000
 TICK_PERIOD_NS = 25_000_000  # how often tick() is to be called
@@ -154,6 +155,14 @@ class Located:
     covariance: F64
 
 
+@runtime_checkable
+class FollowsCorrections(GridLayer, Protocol):
+    """A layer around the robot that forgets: it begins again when the map frame moves under the robot."""
+
+    def start_over(self) -> None:
+        """Forget everything; what was seen last is drawn again."""
+
+
 class Localiser(Protocol):
     """Where the odom frame lies in the map frame: odometry alone, SLAM, or a known map.
 
@@ -177,14 +186,20 @@ class Localiser(Protocol):
     def map_from_odom(self) -> Pose2:
         """The correction as of now."""
 
+    def is_placed(self) -> bool:
+        """Whether the robot knows where it is in a map that was there before: while not, nothing is drawn into it."""
+
     def locate(self, state: OdometryState) -> Located:
         """The base at the newest odometry."""
 
     def located(self) -> Located | None:
         """The base at the newest scan, of a robot without odometry; None if scans say nothing about it."""
 
-    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
-        """Another map was loaded, these tiles; the pose stays until scans say otherwise."""
+    def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
+        """Another map was loaded: tiles of its grid, and of its layer `slam`; the pose stays until scans tell."""
+
+    def kept(self) -> Callable[[], list[StoredTile]] | None:
+        """What is to be stored as of now: makes the tiles of the layer `slam` that changed, in whichever thread."""
 
     def outputs(self, now_ns: int) -> list[Output]:
         """What is due for publication at now_ns."""
@@ -217,14 +232,20 @@ class OdometryOnly:
     def map_from_odom(self) -> Pose2:
         return self._map_from_odom
 
+    def is_placed(self) -> bool:
+        return True
+
     def locate(self, state: OdometryState) -> Located:
         return located_by_odometry(self._map_from_odom, state)
 
     def located(self) -> Located | None:
         return None
 
-    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
+    def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """The robot is where it was."""
+
+    def kept(self) -> Callable[[], list[StoredTile]] | None:
+        return None
 
     def outputs(self, now_ns: int) -> list[Output]:
         return []
@@ -295,6 +316,7 @@ class Fusion:
         self._late_since_ns: int | None = None
         self._tilting = {mount.settings.laser: mount for mount in parts.mounts}
         self._by_axle = {mount.settings.name: mount for mount in parts.mounts}
+        self._around = [grid for grid in parts.grids if isinstance(grid, FollowsCorrections)]
         self._held: deque[tuple[str, Scan | Round | Touch]] = deque()  # covered, until the localiser is ready
 
     # --- what comes in
@@ -618,9 +640,13 @@ class Fusion:
         self._held.extend(released.ready)
         self._draw_held(patience=_HELD_MAX)
 
-    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
-        """The building's grid holds these stored tiles now; the robot's pose stays."""
-        self._parts.localiser.map_was_replaced(tiles)
+    def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
+        """The building's grid holds these stored tiles now; the robot's pose stays. slam: that layer of the map."""
+        self._parts.localiser.map_was_replaced(tiles, slam)
+
+    def kept_of_slam(self) -> Callable[[], list[StoredTile]] | None:
+        """Makes the changed tiles of the layer `slam`, in the thread that writes; None if there is nothing to keep."""
+        return self._parts.localiser.kept()
 
     def drain(self) -> None:
         """Draw what is held back, waiting for whatever it is held back for."""
@@ -686,23 +712,26 @@ class Fusion:
         return laser
 
     def _insert_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
-        for grid in self._parts.grids:
-            if source in grid.sources:
-                try:
-                    grid.take_sweep(source, scan, map_from_sensor)
-                except ValueError:  # farther or longer than a grid can hold
-                    self._drop(source, "map_refused")
+        for grid in self._drawn_by(source):
+            try:
+                grid.take_sweep(source, scan, map_from_sensor)
+            except ValueError:  # farther or longer than a grid can hold
+                self._drop(source, "map_refused")
 
     def _insert_round(self, source: str, heard: Round | Touch, map_from_base: Pose2) -> None:
-        for grid in self._parts.grids:
-            if source in grid.sources:
-                try:
-                    if isinstance(heard, Round):
-                        grid.take_round(source, heard, map_from_base)
-                    else:
-                        grid.take_touch(source, heard, map_from_base)
-                except ValueError:
-                    self._drop(source, "map_refused")
+        for grid in self._drawn_by(source):
+            try:
+                if isinstance(heard, Round):
+                    grid.take_round(source, heard, map_from_base)
+                else:
+                    grid.take_touch(source, heard, map_from_base)
+            except ValueError:
+                self._drop(source, "map_refused")
+
+    def _drawn_by(self, source: str) -> list[GridLayer]:
+        """Grids that take what a source says now."""
+        grids = self._parts.grids if self._parts.localiser.is_placed() else self._around
+        return [grid for grid in grids if source in grid.sources]
 
     # --- small things
 

@@ -26,6 +26,9 @@ log = logging.getLogger(__name__)
 GRID = "grid"
 """The layer of tiles as OccupancyGrid.load_tile takes them; meta `grid` has resolution_m, model and tile_cells."""
 
+SLAM = "slam"
+"""The layer of SLAM's own tiles (service/slam_store.py)."""
+
 T = TypeVar("T")
 
 
@@ -44,8 +47,11 @@ class Drawing(Protocol):
     def drain(self) -> None:
         """Draw what is held back."""
 
-    def map_was_replaced(self, tiles: Iterable[Tile]) -> None:
-        """The grid holds these stored tiles now."""
+    def map_was_replaced(self, tiles: Iterable[Tile], slam: Iterable[Tile]) -> None:
+        """The grid holds these stored tiles now; slam: that layer of the map."""
+
+    def kept_of_slam(self) -> Callable[[], list[Tile]] | None:
+        """Makes the changed tiles of the layer `slam`; None if there is nothing to keep."""
 
 
 class LiveMap:
@@ -74,7 +80,11 @@ class LiveMap:
         """Write what changed since the last one; False if the disk refused (it is tried again with the next)."""
         if self._queue is None:
             return True
-        changed, pose = self._ask(lambda: (self._layer.grid.changed_tiles(), self._fusion.pose()))
+        changed, pose, slam = self._ask(
+            lambda: (self._layer.grid.changed_tiles(), self._fusion.pose(), self._fusion.kept_of_slam())
+        )
+        if slam is not None:
+            self._queue.offer(SLAM, slam())
         if changed:
             self._queue.offer(GRID, ((tile.tile_row, tile.tile_col, tile.payload()) for tile in changed))
             self._queue.offer(OCCUPANCY, occupancy_of(changed), self._meta(pose))
@@ -126,22 +136,23 @@ class LiveMap:
             tiles = saved.load_tiles(GRID)
             ready_made = saved.load_tiles(OCCUPANCY)
             made = {} if self._makers is None else {name: saved.load_tiles(name) for name in self._makers.layers}
+            slam = saved.load_tiles(SLAM)
             check_fits(self._layer.grid, saved)
         if not tiles:
             raise CallRefused(f"{path}: holds no grid to go on with; `umfeld map import` makes one from a picture")
         self._check_tiles(path, tiles)
         self.snapshot()  # so that nothing older waits behind what is written next
-        self._ask(lambda: self._replace(tiles))
+        self._ask(lambda: self._replace(tiles, slam))
         meta = self._meta(None)
         if self._makers is not None:
             self._makers.restore(lambda name: made[name])
-        store.snapshot({GRID: tiles, OCCUPANCY: ready_made, **made}, meta, replace=True)
+        store.snapshot({GRID: tiles, OCCUPANCY: ready_made, SLAM: slam, **made}, meta, replace=True)
         return {"name": name, "path": str(path), "tiles": len(tiles)}
 
-    def _replace(self, tiles: list[Tile]) -> None:
+    def _replace(self, tiles: list[Tile], slam: list[Tile]) -> None:
         self._fusion.drain()
         replace_tiles(self._layer, tiles)
-        self._fusion.map_was_replaced(tiles)
+        self._fusion.map_was_replaced(tiles, slam)
 
     def _check_tiles(self, path: Path, tiles: Iterable[Tile]) -> None:
         """Load them aside first: the live map is replaced as a whole or not at all."""

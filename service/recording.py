@@ -50,6 +50,7 @@ EVENTS = "/umfeld/events"
 FUSION = "/umfeld/fusion"
 RUN, END = "umfeld.run", "umfeld.end"
 TILE = "tile/"
+SLAM_TILE = "slam/"
 SUFFIX = ".mcap"
 STRING = "std_msgs/msg/String"
 CALLS_TYPE = "umfeld_msgs/msg/FusionCalls"
@@ -89,7 +90,7 @@ class Start:
 
     config: the effective configuration as JSON.  sources: every source name; FusionCalls count in this list.
     pose: x, y, yaw of map_from_odom.  complete: from the first byte of a daemon's life, so that a replay ends with the
-    very same map.  tiles: the map as it was, as OccupancyGrid.load_tile takes them.
+    very same map.  tiles: the map as it was, as OccupancyGrid.load_tile takes them.  slam: its layer of that name.
     """
 
     robot: str
@@ -99,6 +100,7 @@ class Start:
     pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
     complete: bool = True
     tiles: tuple[tuple[int, int, bytes], ...] = ()
+    slam: tuple[tuple[int, int, bytes], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ from service.recording import (
     EVENTS,
     FUSION,
     RUN,
+    SLAM_TILE,
     STRING,
     SUFFIX,
     TILE,
@@ -162,9 +163,11 @@ class Files:
             writer.start(profile="ros2", library="umfeld")
             writer.add_metadata(RUN, self._about())
             if self.number == 0:
-                for row, column, payload in self._start.tiles:
-                    stamp_ns = self._begun_ns + self._offset_ns
-                    writer.add_attachment(stamp_ns, stamp_ns, f"{TILE}{row}/{column}", "application/x-umfeld", payload)
+                stamp_ns = self._begun_ns + self._offset_ns
+                for kind, tiles in ((TILE, self._start.tiles), (SLAM_TILE, self._start.slam)):
+                    for row, column, payload in tiles:
+                        name = f"{kind}{row}/{column}"
+                        writer.add_attachment(stamp_ns, stamp_ns, name, "application/x-umfeld", payload)
             self._sync(opened)
         except OSError:
             stream.close()
@@ -186,6 +189,7 @@ class Files:
             "pose": json.dumps(start.pose),
             "complete": str(start.complete).lower(),
             "tiles": str(len(start.tiles)),
+            "slam_tiles": str(len(start.slam)),
             "begun_ns": str(self._begun_ns),
             "wall_offset_ns": str(self._offset_ns),
         }

@@ -17,7 +17,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ from mapping.localise.kept_sweeps import KeptSweep, kept_sweep, shifts_m
 from mapping.localise.pose_graph import composed_poses
 from mapping.scan import Scan
 from service.background import Submit
-from service.fusion import GridLayer, Round
+from service.fusion import FollowsCorrections, GridLayer, Round
 from service.layers import BuildingLayer, insert_round, insert_sweep
 
 log = logging.getLogger(__name__)
@@ -46,14 +45,6 @@ TOLERANCE_M = 0.015
 DELAY_NS = 500_000_000
 DELAY_NS_PER_KEPT = 2_000_000  # about ten times what one takes to draw thrice
 RECENT = 40  # kept sweeps that make up what is around the robot
-
-
-@runtime_checkable
-class FollowsCorrections(GridLayer, Protocol):
-    """A layer in the map frame that forgets: it begins again when the map frame moves under the robot."""
-
-    def start_over(self) -> None:
-        """Forget everything; what was seen last is drawn again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +108,15 @@ class Redrawn:
 
     grid: OccupancyGrid
     places: list[Place]
+
+
+@dataclass(frozen=True, slots=True)
+class RedrawState:
+    """What is kept for drawing again, to be stored. drawn: (N, 2, 3) as in Job.  base: tiles under it all."""
+
+    kept: tuple[Kept, ...]
+    drawn: F64
+    base: Mapping[Place, bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +196,24 @@ class Redrawer:
         self._kept, self._under_way = [], None
         self._last.clear()
         self._base = {(row, col): payload for row, col, payload in base}
+
+    def state(self) -> RedrawState:
+        """As of now."""
+        return RedrawState(tuple(self._kept), self._drawn[: len(self._kept)].copy(), self._base)
+
+    def resume(self, state: RedrawState) -> None:
+        """Take up what was kept of the map that is there now."""
+        self.start_over()
+        self._base = dict(state.base)
+        for kept, ends in zip(state.kept, state.drawn):
+            if isinstance(kept, KeptRound) or kept.sensor in self._mounts:
+                self._keep(kept, ends)
+
+    def forget_recent(self) -> None:
+        """The robot was put elsewhere: what is around it begins again, and the next sweep is kept."""
+        self._last.clear()
+        for layer in self._around:
+            layer.start_over()
 
     # --- correcting
 

@@ -31,7 +31,7 @@ from service.clock import CrankedClock
 from service.config import Config, check
 from service.config_files import Layers
 from service.errors import Trouble
-from service.fusion import TICK_PERIOD_NS, Fusion
+from service.fusion import TICK_PERIOD_NS, Fusion, StoredTile
 from service.outputs import Output, PoseOut
 from service.recording import (
     END,
@@ -41,6 +41,7 @@ from service.recording import (
     READING,
     RUN,
     SETTLE,
+    SLAM_TILE,
     TICK,
     TILE,
     WIRES,
@@ -116,20 +117,20 @@ class Recording:
     def head(self) -> Head:
         """What the run begins from. Trouble if the first file is not one of ours."""
         about: dict[str, str] | None = None
-        tiles: list[tuple[int, int, bytes]] = []
+        tiles: dict[str, list[StoredTile]] = {TILE: [], SLAM_TILE: []}
         for record in _records(self.files[0], []):
             kind = type(record).__name__
             if kind == "Metadata" and record.name == RUN:
                 about = record.metadata
-            elif kind == "Attachment" and record.name.startswith(TILE):
-                row, column = record.name.removeprefix(TILE).split("/")
-                tiles.append((int(row), int(column), record.data))
-            elif kind == "Message" or (about is not None and len(tiles) >= int(about["tiles"])):
+            elif kind == "Attachment" and record.name.startswith((TILE, SLAM_TILE)):
+                layer, row, column = record.name.split("/")
+                tiles[f"{layer}/"].append((int(row), int(column), record.data))
+            elif kind == "Message" or (about is not None and _has_all(about, tiles)):
                 break
         if about is None:
             raise Trouble(f"{self.files[0]}: is not a recording of umfeld (it has no {RUN})")
         try:
-            return _head_of(about, tuple(tiles))
+            return _head_of(about, tuple(tiles[TILE]), tuple(tiles[SLAM_TILE]))
         except (KeyError, ValueError) as error:
             raise Trouble(f"{self.files[0]}: its metadata {RUN} cannot be read: {error}") from error
 
@@ -169,7 +170,11 @@ class Recording:
                 yield Lost(cut[0])
 
 
-def _head_of(about: dict[str, str], tiles: tuple[tuple[int, int, bytes], ...]) -> Head:
+def _has_all(about: dict[str, str], tiles: dict[str, list[StoredTile]]) -> bool:
+    return len(tiles[TILE]) >= int(about["tiles"]) and len(tiles[SLAM_TILE]) >= int(about.get("slam_tiles", "0"))
+
+
+def _head_of(about: dict[str, str], tiles: tuple[StoredTile, ...], slam: tuple[StoredTile, ...]) -> Head:
     x_m, y_m, yaw_rad = json.loads(about["pose"])
     start = Start(
         about["robot"],
@@ -179,6 +184,7 @@ def _head_of(about: dict[str, str], tiles: tuple[tuple[int, int, bytes], ...]) -
         (float(x_m), float(y_m), float(yaw_rad)),
         about["complete"] == "true",
         tiles,
+        slam,
     )
     return Head(start, int(about["begun_ns"]), int(about["wall_offset_ns"]), int(about["number"]))
 
@@ -286,7 +292,8 @@ class Replay:
         maps = assemble.maps(self.config, found)
         self._building = maps.building
         self._load_map()
-        localiser = assemble.localiser(self.config, found, maps, Pose2(*self.head.start.pose), at_once)
+        start = self.head.start
+        localiser = assemble.localiser(self.config, found, maps, Pose2(*start.pose), at_once, stored=start.slam)
         self.fusion = Fusion(assemble.parts(self.config, found, maps, localiser))
         self._waiting: dict[str, deque[Reading | DeviceEvent]] = {}
         self._next_tick_ns = self.head.begun_ns

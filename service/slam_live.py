@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +24,16 @@ from numpy.typing import NDArray
 from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
 from mapping.localise.closures import WorkResult
+from mapping.localise.placing import Placing
 from mapping.localise.slam import Slam, SlamSettings, SlamUpdate
 from mapping.odometry import OdometryState
 from mapping.pose_buffer import PoseBuffer
 from mapping.scan import Scan
 from service.background import Submit
-from service.fusion import Located, Round, compose_many, located_by_odometry
+from service.fusion import Located, Round, StoredTile, compose_many, located_by_odometry
 from service.outputs import DocumentOut, Output
 from service.redraw import Redrawer
+from service.slam_store import Keeper, Stored, stored_of
 
 log = logging.getLogger(__name__)
 
@@ -44,8 +47,22 @@ STILL_M = 1e-3
 STILL_RAD = 1e-3
 MATCH_STILL_NS = 1_000_000_000
 DOUBT_SCANS = 20  # in a row that fit nothing: then it is said
+PLACING_NS = 500_000_000
+PLACING_NS_PER_PLACE = 200_000_000  # several times what a look at one takes
+SEARCH_NS = 5_000_000_000  # then it is looked for again
+SEARCH_M = 1.0
+NOT_PLACED_COVARIANCE: F64 = np.diag([100.0, 100.0, 10.0])
 _GRAPH_PERIOD_NS = 1_000_000_000
 _KEYS_A_SECOND = 2_000  # larger graphs are sent more seldom
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """Looking for the robot in a stored map. odom: where it was when the scan was taken."""
+
+    future: Future[tuple[Pose2, ...]]
+    due_ns: int
+    odom: Pose2
 
 
 class SlamLocaliser:
@@ -59,9 +76,11 @@ class SlamLocaliser:
         submit: Submit,
         redrawer: Redrawer | None = None,
         settings: SlamSettings | None = None,
+        stored: Stored | None = None,
     ) -> None:
         """sources: lasers that are matched.  start: map_from_odom before the first scan.  submit: where closures are
-        looked for.  redrawer: draws the map again after a correction."""
+        looked for.  redrawer: draws the map again after a correction.  stored: the map to go on in, where the robot is
+        first looked for."""
         self._sources = frozenset(sources)
         self._settings = settings
         self._slam = Slam(settings, keep_scans=False)
@@ -74,14 +93,23 @@ class SlamLocaliser:
         self._update_odom = IDENTITY
         self._has_odometry = False
         self._is_broken = False
+        self._search: _Search | None = None
+        self._searched: tuple[int, Pose2] | None = None  # stamp and odometry of the last search
+        self._searches = 0
+        self._hypotheses: tuple[Pose2, tuple[Pose2, ...]] = (IDENTITY, ())  # odometry, and where the base may be then
+        self._keeper = Keeper()
         self._told_ns: int | None = None
         self._told: tuple[int, int, int] | None = None
         self._counts = {"slam.scans": 0, "slam.scans_passed": 0, "slam.scans_unordered": 0, "slam.work_errors": 0}
+        if stored is not None:
+            self._resume(stored)
 
     # --- what fusion asks
 
     def is_ready(self, stamp_ns: int) -> bool:
         late = self._slam.is_due(stamp_ns) and self._work is not None and not self._work.done()
+        search = self._search
+        late |= search is not None and stamp_ns >= search.due_ns and not search.future.done()
         return not late and (self._redrawer is None or self._redrawer.is_ready(stamp_ns))
 
     def take_odometry(self, state: OdometryState) -> None:
@@ -101,7 +129,7 @@ class SlamLocaliser:
             self._redrawer.keep_sweep(sensor, scan, key, self._slam.key_pose(key), ends)
 
     def take_round(self, source: str, heard: Round, odom_from_base: Pose2) -> None:
-        if self._redrawer is not None and self._slam.keys:
+        if self._redrawer is not None and self._update is not None and self._slam.keys:
             key = self._slam.keys - 1
             pose = self._map_from_odom @ odom_from_base
             self._redrawer.keep_round(source, heard, key, self._slam.key_pose(key), pose)
@@ -109,7 +137,13 @@ class SlamLocaliser:
     def map_from_odom(self) -> Pose2:
         return self._map_from_odom
 
+    def is_placed(self) -> bool:
+        return self._update is not None or not self._slam.keys
+
     def locate(self, state: OdometryState) -> Located:
+        if not self.is_placed():
+            pose = self._map_from_odom @ state.odom_from_base
+            return Located(state.stamp_ns, pose, self._map_from_odom, NOT_PLACED_COVARIANCE)
         if self._update is None:
             return located_by_odometry(self._map_from_odom, state)
         step = self._update_odom.inverse() @ state.odom_from_base
@@ -124,13 +158,27 @@ class SlamLocaliser:
             return None
         return Located(self._update.stamp_ns, self._map_from_odom, self._map_from_odom, self._update.covariance)
 
-    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
-        """Key scans belong to the map that is gone."""
+    def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
+        """Key scans belong to the map that is gone; those of the new one are taken up, if it has any."""
         self._slam = Slam(self._settings, keep_scans=False)
-        self._work, self._update, self._told = None, None, None
+        self._work, self._update, self._told, self._search, self._searched = None, None, None, None, None
+        self._keeper, self._searches, self._hypotheses = Keeper(), 0, (IDENTITY, ())
         self._matched.clear()
         if self._redrawer is not None:
             self._redrawer.start_over(tiles)
+        stored = stored_or_none(slam)
+        if stored is not None:
+            self._resume(stored)
+
+    def kept(self) -> Callable[[], list[StoredTile]] | None:
+        if self._redrawer is None or not self._slam.keys:
+            return None
+        return partial(self._keeper.changed_tiles, Stored(self._slam.state(), self._redrawer.state()))
+
+    def _resume(self, stored: Stored) -> None:
+        self._slam.resume(stored.slam)
+        if self._redrawer is not None:
+            self._redrawer.resume(stored.redraw)
 
     def outputs(self, now_ns: int) -> list[Output]:
         state = (self._slam.keys, self._slam.epoch, len(self._slam.closures))
@@ -143,6 +191,11 @@ class SlamLocaliser:
         return [DocumentOut(KEY, self._update.stamp_ns, graph_fields(self._slam))]
 
     def troubles(self) -> list[str]:
+        if not self.is_placed() and self._searches:
+            return [
+                f"the robot does not find itself in the stored map ({self._searches} searches): nothing is drawn "
+                "meanwhile; drive it to where the map is known, or begin a new map with another [store] path"
+            ]
         if self._slam.lost_scans < DOUBT_SCANS:
             return []
         return [
@@ -188,21 +241,25 @@ class SlamLocaliser:
         return way < MATCH_M and turn < MATCH_RAD and waited_ns < MATCH_NS
 
     def _match(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2 | None) -> bool:
+        if not self.is_placed():
+            return self._look_for_place(sensor, scan, base_from_sensor, odom)
         if self._update is not None and scan.stamp_ns <= self._update.stamp_ns:
             self._counts["slam.scans_unordered"] += 1  # sweeps of two lasers that overlap
             return False
         if self._update is None:
             self._slam.begin_at(self._map_from_odom @ (odom or IDENTITY))
         seen_odom = None if self._is_broken else odom
-        self._update = self._slam.add_scan(scan, base_from_sensor, seen_odom, sensor=sensor)
+        self._take_update(self._slam.add_scan(scan, base_from_sensor, seen_odom, sensor=sensor), odom)
         self._is_broken = False
-        self._update_odom = odom or IDENTITY
-        self._map_from_odom = self._update.map_from_base @ self._update_odom.inverse()
-        self._counts["slam.scans"] += 1
         work = self._slam.take_work()
         if work is not None:
             self._work = self._submit(work.run)
         return True
+
+    def _take_update(self, update: SlamUpdate, odom: Pose2 | None) -> None:
+        self._update, self._update_odom = update, odom or IDENTITY
+        self._map_from_odom = update.map_from_base @ self._update_odom.inverse()
+        self._counts["slam.scans"] += 1
 
     def _ends(self, scan: Scan, odom_from_base: PoseBuffer | None) -> F64:
         """(2, 3) base poses in the map at the first and the last beam."""
@@ -211,6 +268,64 @@ class SlamLocaliser:
             return np.array([[pose.x_m, pose.y_m, pose.yaw_rad]] * 2)
         stamps = beam_stamps(scan)
         return compose_many(self._map_from_odom, odom_from_base.at_many(stamps[[0, -1]]))
+
+    # --- finding the place in a stored map
+
+    def _look_for_place(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2 | None) -> bool:
+        """Nothing is drawn before this has found the robot; it may drive meanwhile. Places that look alike go along
+        with odometry until one is left."""
+        at = odom or IDENTITY
+        search = self._search
+        if search is not None:
+            if scan.stamp_ns < search.due_ns:
+                return False
+            self._search = None
+            self._hypotheses = (at, tuple(base @ (search.odom.inverse() @ at) for base in search.future.result()))
+            if len(self._hypotheses[1]) == 1 and self._join(
+                sensor, scan, base_from_sensor, odom, self._hypotheses[1][0]
+            ):
+                return True
+        if self._searched is not None:
+            before_ns, before = self._searched
+            way = before.inverse() @ at
+            if scan.stamp_ns - before_ns < SEARCH_NS and math.hypot(way.x_m, way.y_m) < SEARCH_M:
+                return False
+        placing = self._placing(scan, base_from_sensor, at)
+        if not self._searches:
+            left = placing.left_at(self._map_from_odom @ at @ base_from_sensor)
+            base = None if left is None else left.pose @ base_from_sensor.inverse()
+            if base is not None and self._join(sensor, scan, base_from_sensor, odom, base):
+                return True
+        self._begin_search(placing, base_from_sensor, at)
+        return False
+
+    def _placing(self, scan: Scan, base_from_sensor: Pose2, at: Pose2) -> Placing:
+        state = self._slam.state()
+        told_at, bases = self._hypotheses
+        among = tuple(base @ (told_at.inverse() @ at) @ base_from_sensor for base in bases) if len(bases) > 1 else ()
+        return Placing(state.views, state.poses, scan, among, self._slam.settings.farthest_m)
+
+    def _begin_search(self, placing: Placing, base_from_sensor: Pose2, at: Pose2) -> None:
+        def work() -> tuple[Pose2, ...]:
+            return tuple(place.pose @ base_from_sensor.inverse() for place in placing.run())
+
+        self._searches += 1
+        stamp_ns = placing.scan.stamp_ns
+        self._searched = (stamp_ns, at)
+        due_ns = stamp_ns + PLACING_NS + PLACING_NS_PER_PLACE * placing.cost
+        self._search = _Search(self._submit(work), due_ns, at)
+
+    def _join(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2 | None, map_from_base: Pose2) -> bool:
+        update = self._slam.join(scan, map_from_base, base_from_sensor, odom, sensor=sensor)
+        if update is None:
+            return False
+        self._take_update(update, odom)
+        self._is_broken = False
+        pose = update.map_from_base
+        log.info("found itself in the stored map at x %.2f m y %.2f m", pose.x_m, pose.y_m)
+        if self._redrawer is not None:
+            self._redrawer.forget_recent()
+        return True
 
     # --- corrections
 
@@ -233,6 +348,15 @@ class SlamLocaliser:
             self._map_from_odom = last @ self._update_odom.inverse()
         if self._redrawer is not None and self._slam.epoch != epoch:
             self._redrawer.corrected(stamp_ns, self._slam.key_poses())
+
+
+def stored_or_none(tiles: Iterable[StoredTile]) -> Stored | None:
+    """What the layer `slam` of a map holds; damaged, it is left out, and said."""
+    try:
+        return stored_of(tiles)
+    except ValueError as error:
+        log.error("the map goes on without its key scans, where it was left: %s", error)
+        return None
 
 
 def graph_fields(slam: Slam) -> dict[str, object]:

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from mapping.frames import IDENTITY, Pose2, compose_covariance, exp_se2, log_se2
 from mapping.localise.closures import (
+    REFINING,
     Closure,
     ClosureSettings,
     Snapshot,
@@ -44,7 +45,7 @@ from mapping.localise.closures import (
 from mapping.localise.pose_graph import Edges, composed_poses
 from mapping.localise.scan_match import Match, Reach, agreement, match_view, weakest_information
 from mapping.localise.search import find_view, raster_of
-from mapping.localise.views import BearingTable, View, ViewStore, table_for, view_of
+from mapping.localise.views import BearingTable, View, ViewArrays, ViewStore, table_for, view_of
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -60,6 +61,8 @@ FASTEST_M_S = 20.0
 FASTEST_RAD_S = 4.0
 FINISHING_PASSES = 4
 WORTH_ANOTHER_PASS = 3  # closures gained in one
+PLACED_EXPLAINED = 0.6
+PLACED_OVERLAP = 0.85  # doors and chairs were moved since
 CLEARLY = 1.1  # times better a match must be to be believed against the prediction
 
 
@@ -113,6 +116,27 @@ class SlamUpdate:
     key: int
     is_key: bool
     epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class SlamState:
+    """What is kept of a map, to go on in it: key scans, what was measured between them, closures.
+
+    poses, base_from_sensor: (N, 3).  travel_m, stamps: (N,).  path, information: (N - 1, 3), (N - 1, 3, 3) as measured
+    from one key scan to the next.  weight: (C,) of closures.
+    """
+
+    views: ViewArrays
+    poses: F64
+    travel_m: F64
+    base_from_sensor: F64
+    stamps: I64
+    path: F64
+    information: F64
+    closures: tuple[Closure, ...]
+    weight: F64
+    epoch: int
+    next_number: int
 
 
 class WorkIsDueError(RuntimeError):
@@ -227,6 +251,74 @@ class Slam:
         if self._last is not None:
             raise RuntimeError("the first scan was added already")
         self._start = map_from_base
+
+    # --- going on in a map
+
+    def state(self) -> SlamState:
+        """What is known, as of now; what is on probation is not."""
+        n = len(self._views)
+        edges = self._path_edges()
+        mounts = np.array([_row(each) for each in self._base_from_sensor]).reshape(-1, 3)
+        return SlamState(
+            self._views.arrays(), self._poses[:n].copy(), self._travel[:n].copy(), mounts,
+            np.array(self._key_stamps, dtype=np.int64), edges.measured, edges.information, self.closures,
+            self.closure_weight.copy(), self.epoch, self._next_number,
+        )  # fmt: skip
+
+    def resume(self, state: SlamState) -> None:
+        """Take up a map before the first scan; where the robot is in it, `join` says. ValueError if it is not whole."""
+        n = state.views.count
+        shapes = (state.poses.shape, state.travel_m.shape, state.base_from_sensor.shape, state.stamps.shape)
+        if shapes != ((n, 3), (n,), (n, 3), (n,)) or state.path.shape != (max(0, n - 1), 3):
+            raise ValueError("a stored map whose key scans and poses do not belong together")
+        if len(self._views) or self._last is not None:
+            raise RuntimeError("a map is taken up before the first scan")
+        for row in range(n):
+            self._views.add(state.views.view(row))
+        room = max(64, n)
+        self._poses, self._travel = np.zeros((room, 3)), np.zeros(room)
+        self._poses[:n], self._travel[:n] = state.poses, state.travel_m
+        self._base_from_sensor = [Pose2(*row) for row in state.base_from_sensor.tolist()]
+        inverses = [each.inverse() for each in self._base_from_sensor]
+        self._sensor_from_base = [(p.x_m, p.y_m, p.yaw_rad) for p in inverses]
+        self._key_stamps = state.stamps.tolist()
+        self._path = [(Pose2(*z), w) for z, w in zip(state.path.tolist(), state.information)]
+        self.closures, self.closure_weight = state.closures, state.weight.copy()
+        self.epoch, self._next_number, self._looked_at = state.epoch, state.next_number, n
+
+    def join(
+        self, scan: Scan, map_from_base: Pose2, base_from_sensor: Pose2 = IDENTITY, odom: Pose2 | None = None, *,
+        sensor: str = "",
+    ) -> SlamUpdate | None:  # fmt: skip
+        """Go on in a map that was taken up, the robot having been found there: this scan is its next key scan, tied to
+        those around it by a closure. None, and nothing is changed, if it does not fit there.
+
+        map_from_base: where it was found, to some decimetres.
+        """
+        view = self._view(scan, sensor)
+        if view is None:
+            return None
+        guess = map_from_base @ base_from_sensor
+        rows = nearest_keys(self._poses[: len(self._views)], guess, self.settings.near_m, self.settings.references)
+        match = fitting_match(view, self._views.arrays(), rows, self._poses[rows], guess)
+        if match is None:
+            return None
+        nearest = int(rows[0])
+        start = self._key_pose(nearest)
+        seen = floored(
+            turned_information(match.information(), -start.yaw_rad),
+            self.settings.closures.floor_m,
+            self.settings.closures.floor_rad,
+        )
+        self._keep(scan.stamp_ns, sensor, view, match.pose, base_from_sensor, odom, None)
+        key = len(self._views) - 1
+        closure = Closure(nearest, key, start.inverse() @ match.pose, seen, 1.0, True, self._next_number)
+        self.closures, self.closure_weight = (*self.closures, closure), np.append(self.closure_weight, 1.0)
+        self._next_number += 1
+        self._unoptimised += 1
+        held = floored(match.information(), self.settings.floor_m, self.settings.floor_rad)
+        self._key_covariance = np.asarray(np.linalg.inv(held))
+        return self._told(scan.stamp_ns, match.pose, base_from_sensor, odom, match, True)
 
     # --- scans
 
@@ -669,6 +761,25 @@ class Slam:
     def key_poses(self) -> F64:
         """(K, 3) base poses of key scans."""
         return composed_poses(self._poses[: len(self._views)], np.array(self._sensor_from_base).reshape(-1, 3))
+
+
+def nearest_keys(poses: F64, near: Pose2, within_m: float, most: int) -> I64:
+    """Key scans (K, 3) around a place, the nearest first, those seen from the same side before others; at least one."""
+    distance = np.hypot(poses[:, 0] - near.x_m, poses[:, 1] - near.y_m)
+    order = np.argsort(distance + 1.0 - np.cos(poses[:, 2] - near.yaw_rad), kind="stable")
+    close = order[distance[order] < within_m][:most]
+    return close if len(close) else order[:1]
+
+
+def fitting_match(view: View, store: ViewArrays, rows: I64, poses: F64, guess: Pose2) -> Match | None:
+    """The view laid on key scans from a rough guess; None unless it fits well enough to say where it was taken."""
+    match = match_view(view, store, rows, poses, guess, reach=REFINING)
+    if match is None or weakest_information(match.information()) < HELD_PER_M2:
+        return None
+    agrees = agreement(view, store, rows, poses, match.pose)
+    fits = agrees.explained >= PLACED_EXPLAINED and agrees.overlap >= PLACED_OVERLAP
+    off = guess.inverse() @ match.pose
+    return match if fits and math.hypot(off.x_m, off.y_m) < 0.8 and abs(off.yaw_rad) < math.radians(10.0) else None
 
 
 def run_here(slam: Slam, stamp_ns: int, result: WorkResult | None) -> WorkResult | None:

@@ -68,6 +68,12 @@ def table_for(bearing_rad: F64) -> BearingTable:
     return BearingTable(first, width, round(field / width) + 1 + 2 * margin, False)
 
 
+def table_of(frame: F64) -> BearingTable:
+    """The table that a frame (4,) describes, as BearingTable.frame() made it."""
+    first, width, bins, closed = (float(v) for v in frame)
+    return BearingTable(first, width, int(bins), closed > 0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class View:
     """One sweep in a table's bins; arrays (B,) float32 as described in mapping.kernels.localise_match."""
@@ -111,8 +117,7 @@ class ViewArrays:
 
     def view(self, row: int) -> View:
         """A kept view again."""
-        first, width, bins, closed = (float(v) for v in self.frames[row])
-        table = BearingTable(first, width, int(bins), closed > 0.0)
+        table = table_of(self.frames[row])
         x, y, nx, ny, quality = (a[row, : table.bins] for a in (self.x, self.y, self.nx, self.ny, self.quality))
         return View(table, x, y, nx, ny, quality, int(np.sum(quality > EMPTY)), int(np.sum(quality > 0.0)))
 

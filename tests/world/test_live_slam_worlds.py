@@ -7,9 +7,9 @@ the walls of the grid against those of the world, poses against where the robot 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TypeVar
 
@@ -25,7 +25,7 @@ from mapping.localise.pose_graph import relative_poses
 from service import assemble
 from service.background import Submit, at_once
 from service.config import Config
-from service.fusion import Fusion
+from service.fusion import Fusion, StoredTile
 from service.outputs import DocumentOut, GridOut, GridUpdateOut, Output, PoseOut
 from service.recording import digest_of
 from service.slam_live import SlamLocaliser
@@ -105,16 +105,20 @@ def drive(name: str, laps: float, seed: int = 0) -> Drive:
     period_ns = SWEEP_MS * MS / len(BEARING)
     for stamp in range(SCAN_MS, int(stamps[-1]) - SCAN_MS, SCAN_MS):
         beams_s = stamp * 1e-3 + np.arange(len(BEARING), dtype=np.float64) * period_ns * 1e-9
-        bases = motion.pose_at(beams_s)
-        c, s = np.cos(bases[:, 2]), np.sin(bases[:, 2])
-        origin = bases[:, :2] + np.stack((c * MOUNT.x_m - s * MOUNT.y_m, s * MOUNT.x_m + c * MOUNT.y_m), axis=-1)
-        heading = bases[:, 2] + MOUNT.yaw_rad + BEARING
-        reach = world.beam_distances(origin, heading, beams_s, z_m=HEIGHT_M, range_max_m=RANGE_MAX_M)
+        reach = seen_m(world, motion.pose_at(beams_s), beams_s)
         reach = reach + rng.normal(0.0, 0.01, len(reach))
         scan = ScanReading(stamp * MS, period_ns, SCAN_MS * MS, BEARING, reach, 0.05, RANGE_MAX_M)
         items.append(((stamp + SWEEP_MS) * MS, "front", scan))
     items.sort(key=lambda item: item[0])
     return Drive(world, motion, tuple((source, reading) for _, source, reading in items))
+
+
+def seen_m(world: World, bases: F64, stamps_s: F64) -> F64:
+    """Ranges of a sweep, each beam from its own pose of the base."""
+    c, s = np.cos(bases[:, 2]), np.sin(bases[:, 2])
+    origin = bases[:, :2] + np.stack((c * MOUNT.x_m - s * MOUNT.y_m, s * MOUNT.x_m + c * MOUNT.y_m), axis=-1)
+    heading = bases[:, 2] + MOUNT.yaw_rad + BEARING
+    return world.beam_distances(origin, heading, stamps_s, z_m=HEIGHT_M, range_max_m=RANGE_MAX_M)
 
 
 @dataclass
@@ -176,10 +180,20 @@ class Robot:
                 self.graph = output
 
 
-def robot(start: Pose2, submit: Submit = at_once, config: Config = CONFIG) -> Robot:
+def robot(
+    start: Pose2,
+    submit: Submit = at_once,
+    config: Config = CONFIG,
+    *,
+    tiles: Iterable[StoredTile] = (),
+    slam: Sequence[StoredTile] = (),
+) -> Robot:
     sensors = assemble.sensors(config)
     maps = assemble.maps(config, sensors)
-    localiser = assemble.localiser(config, sensors, maps, start, submit)
+    for row, col, payload in tiles:
+        assert maps.building is not None
+        maps.building.grid.load_tile(row, col, payload)
+    localiser = assemble.localiser(config, sensors, maps, start, submit, stored=slam)
     assert isinstance(localiser, SlamLocaliser)
     assert maps.building is not None
     return Robot(Fusion(assemble.parts(config, sensors, maps, localiser)), localiser, maps.building.grid)
@@ -317,3 +331,103 @@ def test_without_wheels_the_laser_alone_finds_the_way() -> None:
     assert len(made.poses) > 350
     assert np.quantile(pose_errors_m(driving, made.poses), 0.95) < 0.3  # sweeps are not de-skewed
     assert made.fusion.troubles(0) == []
+
+
+# --- going on in a stored map
+
+
+def stored_of(made: Robot) -> tuple[list[StoredTile], list[StoredTile], Pose2]:
+    """Tiles of the grid and of SLAM, and where the robot was left."""
+    keep = made.fusion.kept_of_slam()
+    pose = made.fusion.pose()
+    assert keep is not None
+    assert pose is not None
+    return list(made.grid.tiles()), keep(), pose
+
+
+def gone_on(stored: tuple[list[StoredTile], list[StoredTile], Pose2]) -> Robot:
+    tiles, slam, left_at = stored
+    return robot(left_at, tiles=tiles, slam=slam)
+
+
+def later(driving: Drive, after_s: float, seconds: float) -> list[tuple[str, Reading]]:
+    """What devices say on a part of the way; the clock and the wheels' counts begin anew, as after a power cycle."""
+    first_ns = round(after_s * 1e9)
+    return [
+        (source, replace(reading, stamp_ns=reading.stamp_ns - first_ns))
+        for source, reading in driving.items
+        if first_ns <= reading.stamp_ns < first_ns + seconds * 1e9
+    ]
+
+
+@lru_cache(maxsize=1)
+def stored_loop() -> tuple[list[StoredTile], list[StoredTile], Pose2]:
+    return stored_of(round_the_loop())
+
+
+def errors_after(made: Robot, driving: Drive, after_s: float) -> list[float]:
+    """Of poses that were sure."""
+    found = [pose for pose in made.poses if pose.covariance[0, 0] < 1.0]
+    off = [p.map_from_base.inverse() @ driving.truth(p.stamp_ns + round(after_s * 1e9)) for p in found]
+    return [math.hypot(each.x_m, each.y_m) for each in off]
+
+
+@pytest.mark.parametrize("after_s", [22.0, 30.0, 37.0, 52.0])
+def test_a_robot_that_was_moved_finds_itself_before_it_draws(after_s: float) -> None:
+    """Set down anywhere in the map it had made, where corridors and corners look alike: it must drive on a little."""
+    driving = drive("loop", 1.25)
+    made = gone_on(stored_loop())
+    made.play(later(driving, after_s, 15.0))
+    off = errors_after(made, driving, after_s)
+    assert len(off) > 50
+    assert max(off) < 0.15
+    walls = wall_errors_m(driving, made.grid.patch())
+    assert np.median(walls) <= 0.03
+    assert np.quantile(walls, 0.95) <= 0.08
+    assert made.fusion.troubles(0) == []
+
+
+def test_a_robot_that_nobody_moved_goes_on_at_once() -> None:
+    driving = drive("loop", 1.25)
+    tiles, slam, left_at = stored_loop()
+    pose = driving.truth(driving.items[-1][1].stamp_ns)
+    bases = np.repeat([[pose.x_m, pose.y_m, pose.yaw_rad]], len(BEARING), axis=0)
+    reach = seen_m(driving.world, bases, np.zeros(len(BEARING)))
+    made = robot(left_at, tiles=tiles, slam=slam)
+    items: list[tuple[str, Reading]] = []
+    for k in range(30):
+        items.append(("base", WheelReading(k * 100 * MS, 0, 0, True)))
+        items.append(("front", ScanReading(k * 100 * MS + 1, 0.0, 100 * MS, BEARING, reach, 0.05, RANGE_MAX_M)))
+    made.play([*items, ("base", WheelReading(3_100 * MS, 0, 0, True))])
+    assert made.fusion.troubles(0) == []
+    sure = [each for each in made.poses if each.covariance[0, 0] < 1.0]
+    assert sure[0].stamp_ns < 500 * MS
+    off = sure[-1].map_from_base.inverse() @ pose
+    assert math.hypot(off.x_m, off.y_m) < 0.15  # what the loop left of its drift
+
+
+def test_a_robot_in_another_building_draws_nothing_and_says_so() -> None:
+    made = gone_on(stored_loop())
+    before = digest_of(made.grid)
+    made.play(later(drive("walkers", 0.6, 3), 0.0, 15.0))
+    assert digest_of(made.grid) == before
+    assert "does not find itself" in made.fusion.troubles(0)[0]
+
+
+def test_what_is_stored_comes_back_the_same() -> None:
+    made = round_the_loop()
+    again = gone_on(stored_loop())
+    state, kept = made.localiser.slam.state(), again.localiser.slam.state()
+    np.testing.assert_array_equal(kept.poses, state.poses)
+    np.testing.assert_array_equal(kept.information, state.information)
+    np.testing.assert_allclose(kept.views.x[: len(state.stamps)], state.views.x[: len(state.stamps)], atol=6e-4)
+    assert [each.number for each in kept.closures] == [each.number for each in state.closures]
+    assert sorted(stored_of(again)[1]) == sorted(stored_loop()[1])
+
+
+def test_tiles_that_are_damaged_are_left_out_and_said(caplog: pytest.LogCaptureFixture) -> None:
+    tiles, slam, left_at = stored_loop()
+    torn = [(row, col, payload[: len(payload) // 2]) for row, col, payload in slam]
+    made = robot(left_at, tiles=tiles, slam=torn)
+    assert made.localiser.slam.keys == 0
+    assert "without its key scans" in caplog.text

@@ -211,8 +211,11 @@ class Standing:
     def drain(self) -> None:
         pass
 
-    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
+    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]], slam: Iterable[tuple[int, int, bytes]]) -> None:
         self.replaced_by = list(tiles)
+
+    def kept_of_slam(self) -> None:
+        return None
 
 
 def live(layer: BuildingLayer, store: MapStore | None, pose: Pose2 | None = None) -> LiveMap:
