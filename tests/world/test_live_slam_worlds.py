@@ -422,7 +422,10 @@ def test_what_is_stored_comes_back_the_same() -> None:
     np.testing.assert_array_equal(kept.information, state.information)
     np.testing.assert_allclose(kept.views.x[: len(state.stamps)], state.views.x[: len(state.stamps)], atol=6e-4)
     assert [each.number for each in kept.closures] == [each.number for each in state.closures]
-    assert sorted(stored_of(again)[1]) == sorted(stored_loop()[1])
+    keep_again = again.fusion.kept_of_slam()
+    assert keep_again is not None
+    assert sorted(keep_again()) == sorted(stored_loop()[1])
+    assert keep_again() == []  # nothing changed since
 
 
 def test_tiles_that_are_damaged_are_left_out_and_said(caplog: pytest.LogCaptureFixture) -> None:
