@@ -526,6 +526,12 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         lines = config.lines
         period_ns = round(lines.period_s * 1e9)
         makers.append(LineMaker(LineMap(), fed_by, period_ns=period_ns, min_seen=lines.min_scans))
+    if config.topo.enabled and config.grid.enabled:
+        from service.topo_maker import TopoMaker
+
+        topo = config.topo
+        period_ns = round(topo.period_s * 1e9)
+        makers.append(TopoMaker(period_ns=period_ns, smooth_m=topo.smooth_m, door_m=topo.door_m))
     return makers
 
 

@@ -41,6 +41,7 @@ from service.config_maps import (
     PlaneMapSettings,
     SectorMaps,
     SlamLive,
+    TopoMapSettings,
 )
 from service.errors import WrongUsage
 
@@ -66,6 +67,7 @@ class Config(Section):
     artos: Artos = Field(default=Artos(), description="The ARTOS two-step map.")
     lines: LineMapSettings = Field(default=LineMapSettings(), description="The map of walls as lines.")
     planes: PlaneMapSettings = Field(default=PlaneMapSettings(), description="Planes of tilting lasers.")
+    topo: TopoMapSettings = Field(default=TopoMapSettings(), description="Regions of free space and ways between them.")
     slam: SlamLive = Field(default=SlamLive(), description="Where the robot is, by laser scans.")
     alignment: Alignment = Field(default=Alignment(), description="How long readings wait for each other.")
     network: Network = Field(default=Network(), description="The Zenoh router.")

@@ -118,6 +118,15 @@ class PlaneMapSettings(Section):
     sigma_m: Positive | None = Field(default=None, description="Noise of ranges; default: taken from each cloud.")
 
 
+class TopoMapSettings(Section):
+    """Regions of free space and the passages between them: key map/topo, call @rpc/route. Needs [grid]."""
+
+    enabled: bool = Field(default=False, description="Keep it.")
+    period_s: float = Field(default=5.0, ge=1.0, le=3600, description="Shortest time between two that are made.")
+    smooth_m: float = Field(default=0.15, ge=0.02, le=1.0, description="Regions keep so far off what is not free.")
+    door_m: float = Field(default=1.3, ge=0.1, le=10.0, description="Wider passages join regions to one room.")
+
+
 class SlamLive(Section):
     """Where the robot is: found by laying laser scans on each other, not by the wheels alone."""
 

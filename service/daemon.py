@@ -49,6 +49,7 @@ from service.rpc import CallRefused
 from service.sensors import Chain, Laser
 from service.store import MapStore, Provenance
 from service.systemd import Notifier
+from service.topo_maker import TopoMaker
 from service.worker import Worker
 from service.zenoh_session import NetworkSettings, TlsFiles
 
@@ -143,9 +144,11 @@ class Daemon:
         with _told_if_slow("compiling the kernels, as after each update: some 20 s"):
             assemble.warm_up(config)
         starting()
-        self._makers = MapMakers(
-            assemble.map_makers(config, self._sensors), self._publisher.offer, now_ns=self._clock.now_ns
-        )
+        makers = assemble.map_makers(config, self._sensors)
+        self._makers = MapMakers(makers, self._publisher.offer, now_ns=self._clock.now_ns)
+        for maker in makers:
+            if isinstance(maker, TopoMaker):
+                self._publisher.calls.register("route", partial(self._on_route, maker))
         if store is not None:
             self._makers.restore(store.load_tiles)
         background = Background()
@@ -258,6 +261,9 @@ class Daemon:
         return [] if trouble is None else [trouble]
 
     # --- recording
+
+    def _on_route(self, maker: TopoMaker, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        return self._makers.ask(partial(maker.route, arguments))
 
     def _on_record_start(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Begin a recording on request; every device is set up anew, so that its set-up is in it."""

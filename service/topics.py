@@ -18,6 +18,7 @@ JSON_GRID = "application/json;umfeld.grid.v1"
 JSON_LINES = "application/json;umfeld.lines.v1"
 JSON_GRAPH = "application/json;umfeld.graph.v1"
 JSON_PLANES = "application/json;umfeld.planes.v1"
+JSON_TOPO = "application/json;umfeld.topo.v1"
 JSON_REPLY = "application/json;umfeld.reply.v1"
 
 _CHUNK = re.compile(r"[a-z0-9_-]+\Z")
@@ -249,6 +250,16 @@ MAP_PLANES = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+MAP_TOPO = Topic(
+    "map/topo",
+    "umfeld.topo.v1",
+    JSON_TOPO,
+    "at most every 5 s, on change",
+    "Convex free regions of the grid and the passages between them, as a graph; if configured.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 HEALTH = Topic(
     "health",
     DIAGNOSTICS,
@@ -306,6 +317,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_LINES,
     MAP_GRAPH,
     MAP_PLANES,
+    MAP_TOPO,
     HEALTH,
     HEALTH_JSON,  # before health/<sensor>: the exact key wins
     HEALTH_ONE,

@@ -8,14 +8,14 @@ built. Nodes are named by anything hashable; numbers sort as numbers, all else b
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Hashable, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import networkx as nx
 
-Node = Hashable
+Node = Any  # hashable
 EdgeName = tuple[Node, Node]
 LENGTH = "length_m"
 

@@ -31,6 +31,7 @@ I64 = NDArray[np.int64]
 MOST_CORNERS = 2000
 _CLEAN_M = 1e-6
 _FLAT_RAD = math.radians(2.0)
+_CLEAN_RAD = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,15 +209,20 @@ def _dividing_edges(part: Polygon) -> F64:
     fans: list[list[float]] = [[0.0, float(angle)] for angle in corners.open_rad]
     taken: list[tuple[int, int]] = []
     for i, j in candidates:
-        if not (_is_needed(fans[i], _angle(corners, i, j)) or _is_needed(fans[j], _angle(corners, j, i))):
+        at_i, at_j = _angle(corners, i, j), _angle(corners, j, i)
+        if not (_is_inside(corners, i, at_i) and _is_inside(corners, j, at_j)):
+            continue
+        if not (_is_needed(fans[i], at_i) or _is_needed(fans[j], at_j)) or _passes_corner(corners.points, i, j):
             continue
         if taken and _crosses(corners.points, (i, j), np.array(taken)):
             continue
         taken.append((i, j))
-        fans[i].append(_angle(corners, i, j))
-        fans[j].append(_angle(corners, j, i))
+        fans[i].append(at_i)
+        fans[j].append(at_j)
     for i, j in sorted(taken, key=lambda pair: -math.dist(corners.points[pair[0]], corners.points[pair[1]])):
-        rest = [[a for a in fans[k] if a != _angle(corners, k, other)] for k, other in ((i, j), (j, i))]
+        rest = [list(fans[i]), list(fans[j])]
+        rest[0].remove(_angle(corners, i, j))
+        rest[1].remove(_angle(corners, j, i))
         if all(_widest(fan) <= math.pi + _FLAT_RAD for fan in rest):
             fans[i], fans[j] = rest
             taken.remove((i, j))
@@ -244,12 +250,26 @@ def _angle(corners: _Corners, at: int, other: int) -> float:
     return float((math.atan2(dy, dx) - corners.first_rad[at]) % (2.0 * math.pi))
 
 
+def _is_inside(corners: _Corners, at: int, angle: float) -> bool:
+    """Whether the direction leads into free space here; not along a wall, nor out of another corner at this place."""
+    return _CLEAN_RAD < angle < corners.open_rad[at] - _CLEAN_RAD
+
+
+def _passes_corner(points: F64, i: int, j: int) -> bool:
+    """Whether another corner lies on the edge: then shorter edges do the same."""
+    way, away = points[j] - points[i], points - points[i]
+    length = math.hypot(*way)
+    along = away @ way / length
+    aside = np.abs(away[:, 0] * way[1] - away[:, 1] * way[0]) / length
+    return bool(np.any((along > _CLEAN_M) & (along < length - _CLEAN_M) & (aside < _CLEAN_M)))
+
+
 def _is_needed(fan: list[float], angle: float) -> bool:
     """Whether the direction lies in a wedge of more than half a turn."""
     ordered = sorted(fan)
     for low, high in zip(ordered, ordered[1:]):  # noqa: RUF007 - reads as the wedge that it is
         if low < angle < high:
-            return high - low > math.pi + _FLAT_RAD
+            return bool(high - low > math.pi + _FLAT_RAD)
     return False
 
 

@@ -124,7 +124,7 @@ def test_measured_plan_is_smoothed_first() -> None:
     assert len(decompose(rough).regions) > 10
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     st.lists(st.tuples(*[st.integers(0, 11)] * 2, *[st.integers(1, 4)] * 2, st.integers(0, 3)), max_size=6),
     st.lists(st.tuples(*[st.integers(0, 11)] * 2, *[st.integers(3, 8)] * 2), min_size=1, max_size=4),
