@@ -252,7 +252,7 @@ def _angle(corners: _Corners, at: int, other: int) -> float:
 
 def _is_inside(corners: _Corners, at: int, angle: float) -> bool:
     """Whether the direction leads into free space here; not along a wall, nor out of another corner at this place."""
-    return _CLEAN_RAD < angle < corners.open_rad[at] - _CLEAN_RAD
+    return _CLEAN_RAD < angle < float(corners.open_rad[at]) - _CLEAN_RAD
 
 
 def _passes_corner(points: F64, i: int, j: int) -> bool:
