@@ -128,7 +128,7 @@ def draw_planes(axes: Any, points_m: F64, planes: Planes, *, size: float = 0.4) 
     for number, corners in enumerate(planes.polygon):
         closed = np.concatenate((corners, corners[:1]))
         axes.plot(*closed.T, color=palette[number % _COLORS] * 0.6, linewidth=0.8)
-    axes.set_box_aspect(np.maximum(np.ptp(points_m[there], axis=0), 1e-3) if len(there) else (1, 1, 1))
+    axes.set_box_aspect(np.maximum(np.ptp(points_m[there], axis=0), 1e-3) if len(there) else (1, 1, 1), zoom=1.2)
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     axes.set_zlabel("z, m")

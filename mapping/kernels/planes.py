@@ -34,6 +34,7 @@ _MISS = 0.001  # chance of stopping before a plane that is there was hit
 _STEPS_A_CELL = 6.0
 _JOIN_SLOPES = 5.0  # parts of one plane differ in direction by at most so many times what it may warp
 _WAVE = 0.03  # a surface's scatter about its plane, against that along its shorter side: 0.03 is a kink of 7 degrees
+_FOREIGN = 0.5
 _WORST_DOUBT = 0.13  # rad: half of what normals of neighbours may differ by
 
 
@@ -110,6 +111,17 @@ def usable(points: Any, farthest_m: float) -> Any:
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         good[k] = x * x + y * y + z * z <= limit  # NaN fails
     return good
+
+
+@njit(cache=True, nogil=True)
+def bounds(points: Any, low: Any, high: Any) -> None:
+    """Least and greatest coordinates (3,) of at least one point (N, 3)."""
+    for a in range(3):
+        low[a], high[a] = points[0, a], points[0, a]
+    for k in range(points.shape[0]):
+        for a in range(3):
+            low[a] = min(low[a], points[k, a])
+            high[a] = max(high[a], points[k, a])
 
 
 @njit(cache=True, nogil=True)
@@ -477,47 +489,60 @@ def first_of_run(key: Any, at: int, low: int, shift: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def neighbours_of_cells(key: Any, begin: Any, level: Any, cells: int, deepest: int, shallowest: int) -> Any:
-    """(first, neighbour): cells that touch cell c, corners included, are neighbour[first[c]: first[c + 1]].
-
-    A neighbour is as large, or larger (found here), or smaller (found from there).
-    """
+def names_of_cells(key: Any, begin: Any, level: Any, deepest: int) -> Any:
+    """(mark, index): a table in which cells are found by their names (see put, get)."""
+    cells = begin.size
     size = 16
     while size < 3 * cells:
         size *= 2
     mark, index = np.full(size, -1, np.int64), np.empty(size, np.int64)
     for c in range(cells):
         put(mark, index, tagged(key[begin[c]], level[c], deepest), c)
-    pair = np.empty((26 * cells, 2), np.int64)
+    return mark, index
+
+
+@njit(cache=True, nogil=True)
+def pairs_of_cells(
+    mark: Any, index: Any, key: Any, begin: Any, level: Any, deepest: int, from_cell: int, to_cell: int, pair: Any
+) -> Any:
+    """Cells that touch, corners included: (c, other) for c from from_cell to to_cell - 1 into pair; returns how many.
+
+    Each pair is told once: by the smaller cell, of equal ones by the first.
+    """
     pairs = 0
-    for c in range(cells):
+    for c in range(from_cell, to_cell):
         own = key[begin[c]] >> (3 * (deepest - level[c]))
         i, j, h = squeeze(own), squeeze(own >> 1), squeeze(own >> 2)
         top = 1 << (BITS - (deepest - level[c]))
         before = pairs
         for step in range(27):
-            if step == 13:
-                continue
             a, b, d = i + step // 9 - 1, j + step // 3 % 3 - 1, h + step % 3 - 1
-            if a < 0 or b < 0 or d < 0 or a >= top or b >= top or d >= top:
+            if step == 13 or a < 0 or b < 0 or d < 0 or a >= top or b >= top or d >= top:
                 continue
             there = spread(a) | (spread(b) << 1) | (spread(d) << 2)
             depth = level[c]
-            while depth >= shallowest:
+            other = -1
+            while depth >= 0 and other < 0:
                 other = get(mark, index, (1 << (3 * (BITS - deepest + depth))) | there)
-                if other >= 0:
-                    if depth < level[c] or other > c:
-                        new = other != c
-                        for k in range(before, pairs):
-                            if pair[k, 1] == other:
-                                new = False
-                                break
-                        if new:
-                            pair[pairs, 0], pair[pairs, 1] = c, other
-                            pairs += 1
-                    break
                 there >>= 3
                 depth -= 1
+            if other < 0 or other == c or (level[other] == level[c] and other < c):
+                continue
+            new = True
+            for k in range(before, pairs):
+                if pair[k, 1] == other:
+                    new = False
+                    break
+            if new:
+                pair[pairs, 0], pair[pairs, 1] = c, other
+                pairs += 1
+    return pairs
+
+
+@njit(cache=True, nogil=True)
+def neighbours_of_pairs(pair: Any, cells: int) -> Any:
+    """(first, neighbour): cells that touch cell c are neighbour[first[c]: first[c + 1]]."""
+    pairs = pair.shape[0]
     first = np.zeros(cells + 1, np.int64)
     for k in range(pairs):
         first[pair[k, 0] + 1] += 1
@@ -777,7 +802,8 @@ def label_nearest(
     rules: Any, from_cell: int, to_cell: int, label: Any,
 ) -> None:  # fmt: skip
     """Labels of the points of cells from_cell to to_cell - 1: of the planes of its cell and of those that touch it,
-    the one that is fewest tolerances away, if that is less than one; else -1.
+    the one that is fewest tolerances away, if that is less than one; else -1. The cell's own plane has a start of
+    _FOREIGN, or every plane that ends on a table would cut a strip out of it.
 
     plane: (R, 4) n and d; rms: (R,), a tolerance grows with what a plane's own points scatter.
     """
@@ -800,12 +826,16 @@ def label_nearest(
                 near[count] = r
                 count += 1
         for k in range(begin[c], end[c]):
-            best, at = 1.0, -1
+            best, at = 1.0 + _FOREIGN, -1
             sigma = noise(x[k] * x[k] + y[k] * y[k] + z[k] * z[k], rules)
             for i in range(count):
                 r = near[i]
                 off = abs(plane[r, 0] * x[k] + plane[r, 1] * y[k] + plane[r, 2] * z[k] - plane[r, 3])
                 off /= rules[INLIER_SIGMAS] * max(sigma, rms[r]) + rules[FLAT_M]
+                if off > 1.0:
+                    continue
+                if r != region[c]:
+                    off += _FOREIGN
                 if off < best:
                     best, at = off, r
             label[k] = at

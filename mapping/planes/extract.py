@@ -42,7 +42,7 @@ _NOISE_CELL: Final = 16.0  # a cell is so many times as large as the noise, or i
 _NOISE_MOST: Final = 32  # points of a cell from which noise is taken
 _NOISE_LEAST: Final = 9
 _NOISE_SHARE: Final = 0.4  # of cells scatter less than the noise that is taken: some hold an edge
-_STEP_SAMPLES: Final = 20_000
+_STEP_SAMPLES: Final = 6_000
 _SAME_M: Final = 1e-6  # depths closer than this are one
 _FEWEST_STEPS: Final = 50
 _STEPS_SHARE: Final = 0.1  # of the sample: more different values are no steps
@@ -220,7 +220,7 @@ def extract_planes(
     if sensor.shape != (3,) or not np.all(np.isfinite(sensor)):
         raise ValueError("sensor_m is (3,) and finite")
     chosen = rules or PlaneRules()
-    moved = np.ascontiguousarray(given - sensor)
+    moved = np.ascontiguousarray(given - sensor if np.any(sensor) else given)
     usable = np.flatnonzero(kernels.usable(moved, FARTHEST_M))
     label = np.full(len(given), -1, dtype=np.int64)
     if len(usable) < chosen.min_points:
@@ -241,9 +241,7 @@ class _Extraction:
     def planes(self, usable: I64, label: I64, sensor: F64) -> Planes:
         """Steps 3 to 6."""
         self._fit_cells()
-        first, neighbour = kernels.neighbours_of_cells(
-            self.key, self.begin, self.level, len(self.begin), self.deepest, 0
-        )
+        first, neighbour = self._neighbours()
         region = np.empty(len(self.begin), dtype=np.int64)
         sums = np.zeros((len(region), kernels.ROW))
         fitted = np.flatnonzero(self.row[:, kernels.COUNT] > 0.0)
@@ -264,7 +262,8 @@ class _Extraction:
     def _sort(self, points: F64) -> None:
         """Steps 1 and 2; the lattice stands still in the frame, whatever points there are."""
         rules = self.rules
-        low, high = points.min(axis=0), points.max(axis=0)
+        low, high = np.empty(3), np.empty(3)
+        kernels.bounds(points, low, high)
         finest = rules.cell_m / 2**rules.finer
         self.deepest = rules.coarser + rules.finer
         while float((high - low).max()) / finest >= 2 ** (kernels.BITS - 1) - 2**self.deepest:
@@ -323,6 +322,23 @@ class _Extraction:
         rows, begins, ends, levels = zip(*self.run(work, range(len(cut) - 1)))
         self.row, self.begin = np.concatenate(rows), np.concatenate(begins)
         self.end, self.level = np.concatenate(ends), np.concatenate(levels)
+
+    def _neighbours(self) -> tuple[I64, I64]:
+        """Which cells touch which."""
+        mark, index = kernels.names_of_cells(self.key, self.begin, self.level, self.deepest)
+        cut = np.linspace(0, len(self.begin), _CHUNKS + 1).astype(np.int64)
+
+        def work(part: int) -> I64:
+            first, last = int(cut[part]), int(cut[part + 1])
+            pair = np.empty((26 * (last - first), 2), dtype=np.int64)
+            count = kernels.pairs_of_cells(
+                mark, index, self.key, self.begin, self.level, self.deepest, first, last, pair
+            )
+            return pair[:count]
+
+        pairs = np.concatenate(list(self.run(work, range(_CHUNKS))))
+        first, neighbour = kernels.neighbours_of_pairs(pairs, len(self.begin))
+        return first, neighbour
 
     def _label_by_book(self, region: I64, sums: F64) -> tuple[I64, F64]:
         """Steps 5 and 6: regions of enough cells, and their cells' inliers."""

@@ -183,6 +183,17 @@ def fitted_cells(points: F64, *, deepest: int, book_depth: int, rules: PlaneRule
     return key, row[:count], begin[:count], end[:count], level[:count]
 
 
+def neighbours(key: I64, begin: I64, level: I64, deepest: int) -> tuple[I64, I64]:
+    """Which cells touch which, in two chunks."""
+    mark, index = kernels.names_of_cells(key, begin, level, deepest)
+    pairs = []
+    for first, last in ((0, len(begin) // 3), (len(begin) // 3, len(begin))):
+        pair = np.empty((26 * (last - first), 2), dtype=np.int64)
+        pairs.append(pair[: kernels.pairs_of_cells(mark, index, key, begin, level, deepest, first, last, pair)])
+    start, touching = kernels.neighbours_of_pairs(np.concatenate(pairs), len(begin))
+    return start, touching
+
+
 def test_cells_cover_all_points_once_and_touch_as_boxes_do() -> None:
     points, _ = room()
     points = points[::3]
@@ -199,7 +210,7 @@ def test_cells_cover_all_points_once_and_touch_as_boxes_do() -> None:
         [np.array([kernels.squeeze(int(k) >> a) for k in own]) << (deepest - level) for a in range(3)], axis=1
     )
     high = low + (1 << (deepest - level))[:, None]
-    first, neighbour = kernels.neighbours_of_cells(key, begin, level, len(begin), deepest, 0)
+    first, neighbour = neighbours(key, begin, level, deepest)
     for c in range(0, len(begin), 7):  # literally: boxes that share a face, an edge or a corner
         touching = np.all((low <= high[c]) & (low[c] <= high), axis=1)
         touching[c] = False
@@ -212,7 +223,7 @@ def test_growing_is_the_books() -> None:
     points, _ = room()
     rules = PlaneRules.book()
     key, row, begin, _, level = fitted_cells(points, deepest=0, book_depth=0, rules=rules)
-    first, neighbour = kernels.neighbours_of_cells(key, begin, level, len(begin), 0, 0)
+    first, neighbour = neighbours(key, begin, level, 0)
     seeds = np.flatnonzero(row[:, kernels.COUNT] > 0)
     region = np.empty(len(row), dtype=np.int64)
     count = kernels.grow(row, seeds, first, neighbour, False, rules.vector(RangeNoise(1.0)), region, np.zeros_like(row))
