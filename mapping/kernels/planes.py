@@ -33,7 +33,8 @@ RULES = 15
 _MISS = 0.001  # chance of stopping before a plane that is there was hit
 _STEPS_A_CELL = 6.0
 _JOIN_SLOPES = 5.0  # parts of one plane differ in direction by at most so many times what it may warp
-_WAVE = 0.03  # a surface's scatter about its plane, against that along its shorter side: 0.03 is a kink of 7 degrees
+_WAVE = 0.06  # a surface's scatter about its plane, against that along its shorter side: 0.06 is a kink of 14 degrees
+_ROUGHER = 3.0  # and against that of its parts about theirs: a step scatters more, a wave does not
 _FOREIGN = 0.5
 _WORST_DOUBT = 0.13  # rad: half of what normals of neighbours may differ by
 
@@ -702,14 +703,9 @@ def join_regions(region: Any, first: Any, neighbour: Any, sums: Any, regions: in
 @njit(cache=True, nogil=True)
 def gather_flat(region: Any, regions: int, row: Any, wide: Any, wide_sums: Any, rules: Any, sums: Any) -> Any:
     """Regions most of whose cells lie in one of the wide regions (C,) become one, if that is flat as a whole: seen
-    against its size it scatters as little as _WAVE. A floor that sags stays one plane, a vault does not. region and
-    sums change; returns how many are left."""
+    against its size and against its parts (_WAVE, _ROUGHER). A floor that sags or a ceiling that waves stays one plane;
+    a vault does not, nor two planes with a step between. region and sums change; returns how many are left."""
     wides = wide_sums.shape[0]
-    flat = np.zeros(wides, np.bool_)
-    for r in range(wides):
-        small, middle, _ = fit_plane(wide_sums[r])
-        most = wide_sums[r, WEIGHT] * (0.5 * rules[INLIER_M]) ** 2
-        flat[r] = small <= _WAVE * _WAVE * middle and small <= most
     cells, within = np.zeros(regions, np.int64), np.zeros(regions, np.int64)
     home = np.full(regions, -1, np.int64)
     for turn in range(2):  # a vote for the wide region of most cells (Boyer and Moore), then its count
@@ -723,6 +719,15 @@ def gather_flat(region: Any, regions: int, row: Any, wide: Any, wide_sums: Any, 
                 cells[r] += 1 if home[r] == wide[c] else -1
             else:
                 within[r] += 1 if home[r] == wide[c] else -1
+    apart = np.zeros(wides)
+    for r in range(regions):
+        if home[r] >= 0 and within[r] > 0:
+            apart[home[r]] += square_sum(sums[r])
+    flat = np.zeros(wides, np.bool_)
+    for h in range(wides):
+        small, middle, _ = fit_plane(wide_sums[h])
+        most = wide_sums[h, WEIGHT] * (0.5 * rules[INLIER_M]) ** 2
+        flat[h] = small <= _WAVE * _WAVE * middle and small <= most and small <= _ROUGHER * _ROUGHER * apart[h]
     number, of_wide = np.full(regions, -1, np.int64), np.full(wides, -1, np.int64)
     left = 0
     for r in range(regions):

@@ -145,6 +145,22 @@ def test_a_stair_of_small_steps_is_not_one_plane() -> None:
     np.testing.assert_allclose(np.sort(level), [-0.5, -0.42, -0.34, -0.26], atol=0.003)
 
 
+def test_what_waves_is_one_plane_and_what_stands_back_is_not() -> None:
+    """A ceiling of facets that tilt by 4 degrees to and fro, and a wall with a door that is set back by 4 cm."""
+    random = np.random.default_rng(8)
+    ceiling = patch((0.0, -1.0, 0.0), (3.0, 0, 0), (0, 2.0, 0), 0.025)
+    ceiling[:, 2] = 1.5 + 0.07 * np.abs((ceiling[:, 0] % 0.8) - 0.4)
+    wall = patch((4.0, -1.5, -1.0), (0, 3.0, 0), (0, 0, 2.2), 0.025)
+    in_door = (np.abs(wall[:, 1]) < 0.5) & (wall[:, 2] < 0.9)
+    wall[in_door, 0] += 0.04
+    points = np.concatenate((ceiling, wall)) + random.normal(0.0, 0.002, (len(ceiling) + len(wall), 3))
+    planes = extract_planes(points)
+    assert len(planes) == 3
+    assert len(np.unique(planes.label[: len(ceiling)])) <= 2, "one, and few points of none"
+    leaf, rest = planes.label[len(ceiling) :][in_door], planes.label[len(ceiling) :][~in_door]
+    assert np.bincount(leaf[leaf >= 0]).argmax() != np.bincount(rest[rest >= 0]).argmax()
+
+
 # --- the steps
 
 
