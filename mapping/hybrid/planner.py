@@ -1,0 +1,340 @@
+"""Planning on the Voronoi diagram, made straight on the grid (S44).
+
+A way is looked for on the graph of the diagram, which is small, and then pulled taut on the grid, which makes it about
+as short as any. Every cell that it crosses is free and keeps the clearance; unknown cells are obstacles like others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.grids.geometry import check_resolution
+from mapping.hybrid.voronoi import VoronoiGrid
+from mapping.kernels import paths as kernels
+
+Bools = NDArray[np.bool_]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+HALF_CELLS = math.sqrt(2.0)
+"""A robot anywhere in a cell D cells from an obstacle's cell is at least D - sqrt(2) from the obstacle."""
+
+_USED_AGAIN = 1.4  # what an edge of an earlier way costs in the search for others
+_ELSEWHERE = 0.3  # of an alternative's length, at least
+_PULLS = 4
+_LANDMARKS = 8
+_NEAR_CELLS = 120  # ends nearer than this are joined on the grid, where the diagram may be a detour
+
+
+class NoWayError(ValueError):
+    """There is no way, and why: one of the ends is not free enough, or nothing joins them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """poses: (N, 3) x, y in metres and yaw along the way.  clearance_m: (N,) free room around each pose, at least."""
+
+    poses: F64
+    length_m: float
+    clearance_m: F64
+    least_clearance_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The shortest way found, and others that go elsewhere for a good part, by length."""
+
+    way: Way
+    alternatives: tuple[Way, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DiagramGraph:
+    """The diagram as a graph. node: (N, 2) cells [row, col].  edge: (E, 4) columns of mapping.kernels.paths.
+
+    chain: (K,) cells of all edges, row * C + col.  along: (K,) length from node A, cells.  length, least_squared: (E,).
+    chord: (E,) straight from node to node: what a way that is pulled taut is nearer to.
+    first, link: edges of node n are link[first[n] : first[n + 1]].  leads_out: (N,) the edge out of a dead end, or -1.
+    mark: (L, N) float32 shortest way by chords to each node from some that lie far apart.
+    """
+
+    node: I32
+    node_cell: I32
+    edge: I32
+    chain: I32
+    along: F64
+    length: F64
+    chord: F64
+    least_squared: F64
+    where: I32
+    first: I32
+    link: I32
+    leads_out: I32
+    mark: NDArray[np.float32]
+
+
+def graph_of(grid: VoronoiGrid) -> DiagramGraph:
+    """Thin the diagram to lines of single cells and follow them from node to node."""
+    squared = grid.field.squared
+    cells = np.flatnonzero(grid.axis).astype(np.int32)
+    cells = cells[np.argsort(squared.ravel()[cells], kind="stable")]
+    line = grid.axis.copy()
+    kernels.thin(line, cells)
+    cells = np.sort(cells[line.ravel()[cells]])
+    size = len(cells) + 1
+    where = np.zeros(grid.shape, dtype=np.int32)
+    node, chain = np.empty(size, dtype=np.int32), np.empty(size, dtype=np.int32)
+    along = np.empty(size)
+    edge, measure = np.empty((4 * size, 4), dtype=np.int32), np.empty((4 * size, 2))
+    nodes, chained, edges = kernels.trace(line, squared, cells, where, node, chain, along, edge, measure)
+    edge, measure = edge[:edges].copy(), measure[:edges]
+    ends = np.concatenate((edge[:, kernels.A], edge[:, kernels.B]))
+    number = np.tile(np.arange(edges, dtype=np.int32), 2)
+    order = np.argsort(ends, kind="stable")
+    first = np.searchsorted(ends[order], np.arange(nodes + 1)).astype(np.int32)
+    places = np.stack(np.divmod(node[:nodes], grid.shape[1]), axis=-1).astype(np.int32)
+    link, leads_out = number[order], np.empty(nodes, dtype=np.int32)
+    kernels.find_dead_ends(first, link, edge, leads_out)
+    chord = np.hypot(*(places[edge[:, kernels.A]] - places[edge[:, kernels.B]]).astype(np.float64).T)
+    return DiagramGraph(
+        places, node[:nodes].copy(), edge, chain[:chained].copy(), along[:chained].copy(), measure[:, 0].copy(), chord,
+        measure[:, 1].copy(), where, first, link, leads_out, _landmarks(first, link, edge, chord),
+    )  # fmt: skip
+
+
+def _landmarks(first: I32, link: I32, edge: I32, cost: F64) -> NDArray[np.float32]:
+    """Distances from nodes each of which is as far as can be from those before it."""
+    nodes = len(first) - 1
+    mark = np.empty((min(_LANDMARKS, nodes), nodes), dtype=np.float32)
+    away = np.full(nodes, np.inf, dtype=np.float32)
+    source = 0
+    for row in mark:
+        kernels.distances_from(source, first, link, edge, cost, row)
+        away = np.minimum(away, row)
+        source = int(np.argmax(away))
+    return mark
+
+
+class Planner:
+    """Plans on one state of a grid. Making it costs some tens of milliseconds for millions of cells, a plan little.
+
+    Not to be used from two threads at once. The grid must not change under it.
+    """
+
+    def __init__(self, grid: VoronoiGrid, resolution_m: float, *, row0: int = 0, col0: int = 0) -> None:
+        """row0, col0: the grid's first cell on the map; it begins at x = col0 * resolution_m, y alike."""
+        self.resolution_m = check_resolution(resolution_m)
+        self.grid, self.row0, self.col0 = grid, row0, col0
+        self.graph = graph_of(grid)
+        self._seen: I32 = np.zeros(grid.shape, dtype=np.int32)
+        self._stamp = 0
+        self._queue = np.empty(min(grid.field.squared.size, 1 << 20), dtype=np.int32)
+        self._came = np.empty_like(self._queue)
+
+    def plan(
+        self, start: tuple[float, float], goal: tuple[float, float], *, clearance_m: float = 0.0, alternatives: int = 2
+    ) -> Plan:
+        """A short way from start to goal (x, y, metres) that stays clearance_m from all that is not known to be free.
+
+        alternatives: how many others at most. Raises NoWayError if there is none, ValueError for numbers that are no
+        positions or no clearance.
+        """
+        if not (math.isfinite(clearance_m) and clearance_m >= 0.0):
+            raise ValueError(f"clearance_m is a length, got {clearance_m}")
+        need = clearance_m / self.resolution_m + HALF_CELLS
+        begin, end = self._cell("start", start, need), self._cell("goal", goal, need)
+        ways = self._candidates(begin, end, need, 1 + 2 * alternatives if alternatives > 0 else 1)
+        if not ways:
+            raise NoWayError(f"no way with {clearance_m:.2f} m of clearance leads from the start to the goal")
+        pulled = [self._taut(cells, begin, end, need) for cells in ways]
+        pulled.sort(key=lambda corners: float(kernels.length_of(corners, len(corners))))
+        kept = pulled[:1]
+        for corners in pulled[1:]:
+            if len(kept) <= alternatives and all(_goes_elsewhere(corners, other) for other in kept):
+                kept.append(corners)
+        described = [self._describe(corners) for corners in kept]
+        return Plan(described[0], tuple(described[1:]))
+
+    def _cell(self, what: str, place: tuple[float, float], need: float) -> F64:
+        """(row, col) in cells, a cell's centre at whole numbers; NoWayError if it is not free enough."""
+        at = np.array([place[1], place[0]], dtype=np.float64) / self.resolution_m - (self.row0, self.col0) - 0.5
+        if not np.isfinite(at).all():
+            raise ValueError(f"the {what} is no position: {place}")
+        row, col = (int(v) for v in np.floor(at + 0.5)) if np.abs(at).max() < 1e9 else (-1, -1)
+        height, width = self.grid.shape
+        if not (0 <= row < height and 0 <= col < width) or self.grid.field.squared[row, col] == 0:
+            raise NoWayError(f"the {what} ({place[0]:.2f}, {place[1]:.2f}) is not known to be free")
+        clear = math.sqrt(self.grid.field.squared[row, col])
+        if clear < need:
+            have = max(clear - HALF_CELLS, 0.0) * self.resolution_m
+            raise NoWayError(
+                f"the {what} ({place[0]:.2f}, {place[1]:.2f}) has {have:.2f} m of clearance, "
+                f"asked are {(need - HALF_CELLS) * self.resolution_m:.2f} m"
+            )
+        return at
+
+    def _candidates(self, begin: F64, end: F64, need: float, tries: int) -> list[I32]:
+        """Ways from cell to cell: straight or on the grid if the ends are near; on the graph, shortest first."""
+        squared, width = self.grid.field.squared, self.grid.shape[1]
+        start, goal = (int(r) * width + int(c) for r, c in (np.floor(begin + 0.5), np.floor(end + 0.5)))
+        found: list[I32] = []
+        if kernels.sees(squared, need, *begin, *end):
+            found.append(np.empty(0, dtype=np.int32))
+        need2 = math.ceil(need * need)
+        if not found and math.hypot(*(end - begin)) <= _NEAR_CELLS:
+            cells = self._on_grid(start, goal, need2)
+            if len(cells):
+                found.append(cells)
+        if found and tries == 1:
+            return found
+        outward, met = self._reach(start, goal, need2)
+        if outward is None:
+            return found
+        if met:
+            return [*found, outward]
+        inward, _ = self._reach(goal, -1, need2)
+        if inward is None:
+            return found
+        first, last = self._joints(int(outward[-1]), need2), self._joints(int(inward[-1]), need2)
+        along = self._within_edge(int(outward[-1]), int(inward[-1]), need2)
+        if along is not None:
+            found.append(np.concatenate((outward, along, inward[::-1])))
+        graph = self.graph
+        seeds, ends = (np.array([node for node, _, _ in joints], dtype=np.int32) for joints in (first, last))
+        seed_cost, end_cost = (np.array([way for _, way, _ in joints], dtype=np.float64) for joints in (first, last))
+        usable = np.empty(len(graph.edge), dtype=np.bool_)
+        kernels.open_edges(
+            graph.edge, graph.least_squared, need2, graph.leads_out, np.concatenate((seeds, ends)), usable
+        )
+        cost = graph.chord.copy()
+        via = np.empty(len(graph.node), dtype=np.int32)
+        cells = np.empty(len(graph.chain) + len(graph.node), dtype=np.int32)
+        used = np.empty(len(graph.edge), dtype=np.int32)
+        for _ in range(tries):
+            node, _total = kernels.shortest_way(
+                graph.first, graph.link, graph.edge, cost, usable, graph.mark, seeds, seed_cost, ends, end_cost, via
+            )  # fmt: skip
+            if node < 0:
+                break
+            k, m = kernels.cells_of_way(graph.node_cell, graph.edge, graph.chain, via, node, cells, used)
+            begun = int(np.flatnonzero(graph.node_cell == cells[k - 1])[0])
+            backwards = (inward, self._joint_cells(last, node), cells[:k], self._joint_cells(first, begun)[::-1])
+            found.append(np.concatenate((*backwards, outward[::-1]))[::-1])
+            cost[used[:m]] *= _USED_AGAIN
+        return found
+
+    def _on_grid(self, start: int, goal: int, need2: int) -> I32:
+        """Cells of the shortest way within a window around both; none if there is no such way."""
+        (height, width), margin = self.grid.shape, _NEAR_CELLS // 3
+        rows, cols = sorted((start // width, goal // width)), sorted((start % width, goal % width))
+        top, left = max(rows[0] - margin, 0), max(cols[0] - margin, 0)
+        window = min(rows[1] + margin + 1, height) - top, min(cols[1] + margin + 1, width) - left
+        cells = np.empty(window[0] * window[1], dtype=np.int32)
+        n = int(kernels.way_on_grid(self.grid.field.squared, need2, start, goal, top, left, *window, cells))
+        return cells[:n][::-1]
+
+    def _reach(self, start: int, goal: int, need2: int) -> tuple[I32 | None, bool]:
+        """Cells from start to the diagram (or to the goal: True)."""
+        self._stamp += 1
+        i = int(
+            kernels.reach_line(
+                self.grid.field.squared,
+                self.graph.where,
+                need2,
+                start,
+                goal,
+                self._seen,
+                self._stamp,
+                self._queue,
+                self._came,
+            )
+        )
+        if i < 0:
+            return None, False
+        cells = []
+        met = int(self._queue[i]) == goal
+        while i >= 0:
+            cells.append(int(self._queue[i]))
+            i = int(self._came[i])
+        return np.array(cells[::-1], dtype=np.int32), met
+
+    def _joints(self, cell: int, need2: int) -> list[tuple[int, float, I32]]:
+        """Nodes that a cell of the diagram leads to along its edge: node, length, cells on the way there."""
+        graph, flat = self.graph, self.grid.field.squared.ravel()
+        at = int(graph.where.ravel()[cell])
+        if at < 0:
+            return [(-at - 1, 0.0, np.empty(0, dtype=np.int32))]
+        e, k = self._edge_of(at - 1), at - 1
+        a, b, k0, k1 = (int(v) for v in graph.edge[e])
+        joints = []
+        for node, cells, length in (
+            (a, graph.chain[k0 : k + 1][::-1], float(graph.along[k])),
+            (b, graph.chain[k:k1], float(graph.length[e] - graph.along[k])),
+        ):
+            if flat[cells].min() >= need2 and flat[graph.node_cell[node]] >= need2:
+                joints.append((node, length, cells))
+        return joints
+
+    def _within_edge(self, first: int, last: int, need2: int) -> I32 | None:
+        """Cells between two cells of one edge, along it; None if they are not, or it is too narrow between."""
+        where = self.graph.where.ravel()
+        a, b = int(where[first]) - 1, int(where[last]) - 1
+        if a < 0 or b < 0 or self._edge_of(a) != self._edge_of(b):
+            return None
+        cells = self.graph.chain[a : b + 1] if a <= b else self.graph.chain[b : a + 1][::-1]
+        return cells if self.grid.field.squared.ravel()[cells].min() >= need2 else None
+
+    def _edge_of(self, k: int) -> int:
+        return int(np.searchsorted(self.graph.edge[:, kernels.BEGIN], k, side="right")) - 1
+
+    def _joint_cells(self, joints: list[tuple[int, float, I32]], node: int) -> I32:
+        """Cells from the diagram cell of the joint to the node."""
+        return min((each for each in joints if each[0] == node), key=lambda each: each[1])[2]
+
+    def _taut(self, cells: I32, begin: F64, end: F64, need: float) -> F64:
+        """(N, 2) corners of the way, in cells."""
+        rows, cols = np.divmod(cells, self.grid.shape[1])
+        n = len(cells) + 2
+        points = np.empty((3 * n + 2 * int(math.hypot(*(end - begin))) + 16, 2))
+        points[0], points[n - 1] = begin, end
+        points[1 : n - 1, 0], points[1 : n - 1, 1] = rows, cols
+        work = np.empty_like(points)
+        n = int(kernels.taut(self.grid.field.squared, need, points, n, _PULLS, work))
+        return points[:n].copy()
+
+    def _describe(self, corners: F64) -> Way:
+        """Poses at the corners and between them, at most half a metre apart."""
+        squared, d = self.grid.field.squared, self.resolution_m
+        spacing = 0.5 / d
+        length = float(kernels.length_of(corners, len(corners)))
+        points = np.empty((int(length / spacing) + 2 * len(corners) + 2, 2))
+        n = int(kernels.refine(corners, len(corners), spacing, points))
+        points = points[:n]
+        xy = (points[:, ::-1] + 0.5 + (self.col0, self.row0)) * d
+        step = np.diff(xy, axis=0)
+        yaw = np.arctan2(step[:, 1], step[:, 0]) if len(step) else np.zeros(0)
+        yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
+        cells = np.floor(points + 0.5).astype(np.int64)
+        clear = np.maximum(np.sqrt(squared[cells[:, 0], cells[:, 1]]) - HALF_CELLS, 0.0) * d
+        least = max(math.sqrt(kernels.least_along(squared, corners, len(corners))) - HALF_CELLS, 0.0) * d
+        return Way(np.column_stack((xy, yaw)), length * d, clear, least)
+
+
+def _goes_elsewhere(corners: F64, other: F64) -> bool:
+    """Whether a good part of one way lies well off another."""
+    mine, others = _samples(corners), _samples(other)
+    away = np.hypot(mine[:, None, 0] - others[:, 0], mine[:, None, 1] - others[:, 1]).min(axis=1)
+    step = np.hypot(*(others[1] - others[0]))
+    return bool(np.mean(away > max(10.0, step)) >= _ELSEWHERE)
+
+
+def _samples(corners: F64, count: int = 64) -> F64:
+    """(count, 2) points evenly along a way."""
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
+    at = np.linspace(0.0, along[-1], count)
+    return np.stack((np.interp(at, along, corners[:, 0]), np.interp(at, along, corners[:, 1])), axis=-1)

@@ -1,0 +1,179 @@
+"""Ways on the Voronoi diagram against ways on the grid, found with networkx."""
+
+from __future__ import annotations
+
+import math
+
+import networkx as nx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapping.hybrid.planner import HALF_CELLS, NoWayError, Planner, Way, graph_of
+from mapping.hybrid.voronoi import VoronoiGrid
+from mapping.kernels import paths as kernels
+from mapping.kernels.rooms import connected
+
+Bools = NDArray[np.bool_]
+CELL_M = 0.05
+
+
+def place(row: int, col: int) -> tuple[float, float]:
+    return (col + 0.5) * CELL_M, (row + 0.5) * CELL_M
+
+
+def cluttered(seed: int, rows: int = 90, cols: int = 120) -> Bools:
+    """Two halls, a wall with two openings between them, boxes everywhere."""
+    random = np.random.default_rng(seed)
+    free = np.zeros((rows, cols), dtype=np.bool_)
+    free[2:-2, 2:-2] = True
+    free[:, cols // 2] = False
+    for at in random.integers(4, rows - 14, size=2):
+        free[at : at + 9, cols // 2] = True
+    for _ in range(12):
+        r, c = random.integers(2, rows - 8), random.integers(2, cols - 8)
+        free[r : r + random.integers(1, 6), c : c + random.integers(1, 6)] = False
+    return free
+
+
+def grid_lengths(grid: VoronoiGrid, clearance_m: float, start: tuple[int, int]) -> dict[tuple[int, int], float]:
+    """Metres from start to every cell that can be reached with the clearance, by steps to the eight neighbours."""
+    allowed = grid.field.squared >= (clearance_m / CELL_M + HALF_CELLS) ** 2
+    graph = nx.Graph()
+    for r, c in np.argwhere(allowed).tolist():
+        graph.add_node((r, c))
+        for rr, cc in ((r + 1, c - 1), (r + 1, c), (r + 1, c + 1), (r, c + 1)):
+            if rr < allowed.shape[0] and 0 <= cc < allowed.shape[1] and allowed[rr, cc]:
+                graph.add_edge((r, c), (rr, cc), weight=CELL_M * math.hypot(rr - r, cc - c))
+    lengths: dict[tuple[int, int], float] = nx.single_source_dijkstra_path_length(graph, start)
+    return lengths
+
+
+def check_way(way: Way, grid: VoronoiGrid, clearance_m: float) -> None:
+    """Length, yaw and spacing agree; points all along the way are as far from the obstacles' squares as is told."""
+    steps = np.diff(way.poses[:, :2], axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    assert way.length_m == pytest.approx(lengths.sum())
+    assert lengths.max(initial=0.0) <= 0.5 + 1e-9
+    assert np.allclose(np.arctan2(steps[:, 1], steps[:, 0]), way.poses[:-1, 2])
+    assert way.least_clearance_m >= clearance_m - 1e-9
+    assert way.least_clearance_m <= way.clearance_m.min() + 1e-9
+    squares = (np.argwhere(grid.field.obstacle)[:, ::-1] + 0.5) * CELL_M
+    for (a, b), told in zip(zip(way.poses[:-1, :2], way.poses[1:, :2]), way.clearance_m):
+        t = np.linspace(0.0, 1.0, 2 + int(4 * np.hypot(*(b - a)) / CELL_M))[:, None]
+        beyond = np.maximum(np.abs((a + t * (b - a))[:, None, :] - squares) - 0.5 * CELL_M, 0.0)
+        away = np.hypot(beyond[..., 0], beyond[..., 1]).min(axis=1)
+        assert away.min() >= way.least_clearance_m - 1e-9
+        assert away[0] >= told - 1e-9
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("clearance_m", [0.0, 0.1])
+def test_ways_exist_where_the_grid_has_one_and_are_about_as_short(seed: int, clearance_m: float) -> None:
+    grid = VoronoiGrid(cluttered(seed), gap_cells=1.0)
+    planner = Planner(grid, CELL_M)
+    random = np.random.default_rng(seed)
+    places = np.argwhere(grid.field.squared >= (clearance_m / CELL_M + HALF_CELLS) ** 2)
+    start = tuple(int(v) for v in places[random.integers(len(places))])
+    lengths = grid_lengths(grid, clearance_m, (start[0], start[1]))
+    ratios = []
+    for goal in places[random.integers(len(places), size=12)].tolist():
+        expected = lengths.get((goal[0], goal[1]))
+        if expected is None:
+            with pytest.raises(NoWayError, match="no way"):
+                planner.plan(place(*start), place(*goal), clearance_m=clearance_m)
+            continue
+        plan = planner.plan(place(*start), place(*goal), clearance_m=clearance_m)
+        check_way(plan.way, grid, clearance_m)
+        for other in plan.alternatives:
+            check_way(other, grid, clearance_m)
+            assert other.length_m >= plan.way.length_m
+        assert plan.way.poses[0, :2] == pytest.approx(place(*start))
+        assert plan.way.poses[-1, :2] == pytest.approx(place(*goal))
+        ratios.append(plan.way.length_m / max(expected, CELL_M))
+    assert np.median(ratios) <= 1.0  # any direction is allowed, on the grid only eight
+    assert max(ratios) <= 1.03
+
+
+def test_two_openings_give_an_alternative() -> None:
+    free = np.zeros((100, 120), dtype=np.bool_)
+    free[2:-2, 2:-2] = True
+    free[:, 60] = False
+    free[10:22, 60] = free[75:90, 60] = True
+    plan = Planner(VoronoiGrid(free), CELL_M).plan(place(30, 20), place(30, 100), clearance_m=0.1)
+    assert len(plan.alternatives) == 1
+    assert plan.way.poses[:, 1].min() < 22 * CELL_M
+    assert plan.alternatives[0].poses[:, 1].max() > 75 * CELL_M
+
+
+def test_clearance_closes_a_narrow_door() -> None:
+    free = np.zeros((60, 90), dtype=np.bool_)
+    free[2:-2, 2:-2] = True
+    free[:, 45] = False
+    free[20:30, 45] = True  # half a metre
+    planner = Planner(VoronoiGrid(free), CELL_M)
+    assert planner.plan(place(10, 10), place(10, 80), clearance_m=0.15).way.least_clearance_m >= 0.15
+    with pytest.raises(NoWayError, match=r"0\.25 m of clearance"):
+        planner.plan(place(10, 10), place(10, 80), clearance_m=0.25)
+
+
+def test_ends_must_be_free_and_say_how_free_they_are() -> None:
+    free = np.ones((60, 60), dtype=np.bool_)
+    free[30, 30] = False
+    planner = Planner(VoronoiGrid(free), CELL_M, row0=-100, col0=40)
+    with pytest.raises(NoWayError, match=r"start .* not known to be free"):
+        planner.plan((0.0, 0.0), (3.0, -4.0))
+    inside = (40 * CELL_M + 1.0, -100 * CELL_M + 1.0)
+    with pytest.raises(NoWayError, match=r"goal .* not known to be free"):
+        planner.plan(inside, (40 * CELL_M + 30.5 * CELL_M, -100 * CELL_M + 30.5 * CELL_M))
+    with pytest.raises(NoWayError, match=r"has 0\.\d\d m of clearance, asked are 0\.40 m"):
+        planner.plan(inside, (40 * CELL_M + 0.3, -100 * CELL_M + 1.0), clearance_m=0.4)
+    with pytest.raises(ValueError, match="no position"):
+        planner.plan((math.nan, 0.0), inside)
+    with pytest.raises(ValueError, match="clearance_m"):
+        planner.plan(inside, inside, clearance_m=-0.1)
+    still = planner.plan(inside, inside)
+    assert still.way.length_m == 0.0
+
+
+def test_the_graph_is_the_diagram_line_by_line() -> None:
+    grid = VoronoiGrid(cluttered(3))
+    graph = graph_of(grid)
+    cells = np.concatenate((graph.chain, graph.node_cell))
+    assert len(np.unique(cells)) == len(cells)
+    assert grid.axis.ravel()[cells].all()
+    for e, (a, b, begin, end) in enumerate(graph.edge.tolist()):
+        run = np.concatenate(([graph.node_cell[a]], graph.chain[begin:end], [graph.node_cell[b]]))
+        rows, cols = np.divmod(run, grid.shape[1])
+        steps = np.hypot(np.diff(rows), np.diff(cols))
+        assert (steps <= math.sqrt(2.0) + 1e-9).all()
+        assert graph.length[e] == pytest.approx(steps.sum())
+        assert graph.least_squared[e] == grid.field.squared.ravel()[run].min()
+    whole = nx.MultiGraph()
+    whole.add_nodes_from(range(len(graph.node)))
+    whole.add_edges_from((int(a), int(b)) for a, b, _, _ in graph.edge)
+    # Thinning keeps what hangs together: as many pieces, and as many rings, as the diagram has.
+    label = np.empty(grid.shape, dtype=np.int32)
+    assert nx.number_connected_components(whole) == connected(grid.axis, True, label)
+    for n in np.flatnonzero(graph.leads_out >= 0).tolist():
+        assert n in graph.edge[graph.leads_out[n], :2]
+
+
+def test_shortest_way_is_that_of_networkx() -> None:
+    graph = graph_of(VoronoiGrid(cluttered(5)))
+    reference = nx.Graph()
+    for e, (a, b, _, _) in enumerate(graph.edge.tolist()):
+        known = reference.get_edge_data(a, b, {"weight": math.inf})["weight"]
+        reference.add_edge(a, b, weight=min(known, float(graph.chord[e])))
+    random, usable = np.random.default_rng(0), np.ones(len(graph.edge), dtype=np.bool_)
+    via = np.empty(len(graph.node), dtype=np.int32)
+    lengths = dict(nx.all_pairs_dijkstra_path_length(reference))
+    for a, b in random.integers(len(graph.node), size=(40, 2)).tolist():
+        last, total = kernels.shortest_way(
+            graph.first, graph.link, graph.edge, graph.chord, usable, graph.mark, np.array([a], dtype=np.int32),
+            np.zeros(1), np.array([b], dtype=np.int32), np.zeros(1), via,
+        )  # fmt: skip
+        if b in lengths.get(a, {}):
+            assert (last, total) == (b, pytest.approx(lengths[a][b]))
+        else:
+            assert last == -1
