@@ -13,6 +13,7 @@ A*          on the grid with the same cells allowed, eight neighbours, straight 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import math
 import sys
@@ -148,7 +149,7 @@ def diagram_figures(free: Bools) -> dict[str, float]:
         times.append(1e3 * (time.perf_counter() - started))
     figures |= {"update_ms": float(np.median(times[5:])), "update_most_ms": max(times[5:])}
     try:
-        from skimage.morphology import medial_axis
+        medial_axis = importlib.import_module("skimage.morphology").medial_axis
     except ImportError:
         return figures
     return {**figures, "skimage_medial_axis_ms": timed(lambda: medial_axis(free, return_distance=True), 3)}
@@ -163,7 +164,7 @@ def planning_figures(free: Bools, pairs: int) -> dict[str, float]:
     rows: list[tuple[float, float, float, float]] = []
     missed = tried = 0
     while len(rows) < pairs:
-        start, goal = (tuple(int(v) for v in room[i]) for i in random.integers(len(room), size=2))
+        start, goal = ((int(room[i, 0]), int(room[i, 1])) for i in random.integers(len(room), size=2))
         places = [((c + 0.5) * CELL_M, (r + 0.5) * CELL_M) for r, c in (start, goal)]
         tried += 1
         started = time.perf_counter()

@@ -406,7 +406,7 @@ def way_on_grid(
             if rr < 0 or rr >= rows or cc < 0 or cc >= cols or squared[rr + top, cc + left] < need2:
                 continue
             other = rr * cols + cc
-            reached = np.float32(best[here] + (1.41421356 if _ROW_STEP[k] != 0 and _COL_STEP[k] != 0 else 1.0))
+            reached: Any = np.float32(best[here] + (1.41421356 if _ROW_STEP[k] != 0 and _COL_STEP[k] != 0 else 1.0))
             if reached < best[other] and not done[other]:
                 best[other] = reached
                 came[other] = k

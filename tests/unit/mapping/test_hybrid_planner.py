@@ -39,7 +39,7 @@ def cluttered(seed: int, rows: int = 90, cols: int = 120) -> Bools:
 def grid_lengths(grid: VoronoiGrid, clearance_m: float, start: tuple[int, int]) -> dict[tuple[int, int], float]:
     """Metres from start to every cell that can be reached with the clearance, by steps to the eight neighbours."""
     allowed = grid.field.squared >= (clearance_m / CELL_M + HALF_CELLS) ** 2
-    graph = nx.Graph()
+    graph: nx.Graph[tuple[int, int]] = nx.Graph()
     for r, c in np.argwhere(allowed).tolist():
         graph.add_node((r, c))
         for rr, cc in ((r + 1, c - 1), (r + 1, c), (r + 1, c + 1), (r, c + 1)):
@@ -149,7 +149,7 @@ def test_the_graph_is_the_diagram_line_by_line() -> None:
         assert (steps <= math.sqrt(2.0) + 1e-9).all()
         assert graph.length[e] == pytest.approx(steps.sum())
         assert graph.least_squared[e] == grid.field.squared.ravel()[run].min()
-    whole = nx.MultiGraph()
+    whole: nx.MultiGraph[int] = nx.MultiGraph()
     whole.add_nodes_from(range(len(graph.node)))
     whole.add_edges_from((int(a), int(b)) for a, b, _, _ in graph.edge)
     # Thinning keeps what hangs together: as many pieces, and as many rings, as the diagram has.
@@ -161,7 +161,7 @@ def test_the_graph_is_the_diagram_line_by_line() -> None:
 
 def test_shortest_way_is_that_of_networkx() -> None:
     graph = graph_of(VoronoiGrid(cluttered(5)))
-    reference = nx.Graph()
+    reference: nx.Graph[int] = nx.Graph()
     for e, (a, b, _, _) in enumerate(graph.edge.tolist()):
         known = reference.get_edge_data(a, b, {"weight": math.inf})["weight"]
         reference.add_edge(a, b, weight=min(known, float(graph.chord[e])))
