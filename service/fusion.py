@@ -180,8 +180,8 @@ class Localiser(Protocol):
         """Each sweep that odometry covers, in order of stamps, before it is put into the grids. odom_from_base: None on
         a robot without odometry, whose odom frame is then its base."""
 
-    def take_round(self, source: str, heard: Round, odom_from_base: Pose2) -> None:
-        """Each round of sonars that is put into the grids."""
+    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> None:
+        """Each round of sonars, and each touch, that is put into the grids."""
 
     def map_from_odom(self) -> Pose2:
         """The correction as of now."""
@@ -226,7 +226,7 @@ class OdometryOnly:
     def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
         """Nothing to learn from it."""
 
-    def take_round(self, source: str, heard: Round, odom_from_base: Pose2) -> None:
+    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> None:
         """Nothing to learn from it."""
 
     def map_from_odom(self) -> Pose2:
@@ -683,8 +683,7 @@ class Fusion:
         localiser = self._parts.localiser
         if isinstance(value, Round | Touch):
             odom_from_base = self._poses.at(value.stamp_ns)
-            if isinstance(value, Round):
-                localiser.take_round(source, value, odom_from_base)
+            localiser.take_round(source, value, odom_from_base)
             self._insert_round(source, value, localiser.map_from_odom() @ odom_from_base)
             return
         base_from_sensor = self._laser(source).base_from_sensor
@@ -697,8 +696,7 @@ class Fusion:
         """Without odometry: where the localiser has it, by scans alone."""
         localiser = self._parts.localiser
         if isinstance(value, Round | Touch):
-            if isinstance(value, Round):
-                localiser.take_round(source, value, IDENTITY)
+            localiser.take_round(source, value, IDENTITY)
             self._insert_round(source, value, localiser.map_from_odom())
             return
         base_from_sensor = self._laser(source).base_from_sensor

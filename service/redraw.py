@@ -28,8 +28,8 @@ from mapping.localise.kept_sweeps import KeptSweep, kept_sweep, shifts_m
 from mapping.localise.pose_graph import composed_poses
 from mapping.scan import Scan
 from service.background import Submit
-from service.fusion import FollowsCorrections, GridLayer, Round
-from service.layers import BuildingLayer, insert_round, insert_sweep
+from service.fusion import FollowsCorrections, GridLayer, Round, Touch
+from service.layers import BuildingLayer, insert_round, insert_sweep, insert_touch
 
 log = logging.getLogger(__name__)
 
@@ -44,22 +44,23 @@ STEP_RAD = math.radians(5.0)
 TOLERANCE_M = 0.015
 DELAY_NS = 500_000_000
 DELAY_NS_PER_KEPT = 2_000_000  # about ten times what one takes to draw thrice
+TOUCH_REACH_M = 3.0  # a switch sits on the robot
 RECENT = 40  # kept sweeps that make up what is around the robot
 
 
 @dataclass(frozen=True, slots=True)
 class KeptRound:
-    """Sonars, kept like a sweep: see KeptSweep."""
+    """A round of sonars, or a touch, kept like a sweep: see KeptSweep."""
 
     sensor: str
     key: int
     in_key: F64
-    heard: Round
+    heard: Round | Touch
 
     @property
     def reach_m(self) -> float:
         """The farthest that it says anything about."""
-        return self.heard.range_max_m
+        return self.heard.range_max_m if isinstance(self.heard, Round) else TOUCH_REACH_M
 
 
 Kept = KeptSweep | KeptRound
@@ -191,6 +192,12 @@ class Redrawer:
         self._key[n], self._in_key[n], self._drawn[n], self._reach[n] = kept.key, kept.in_key, ends, kept.reach_m
         self._kept.append(kept)
 
+    def keep_touch(self, source: str, touch: Touch, key: int, key_pose: Pose2, map_from_base: Pose2) -> None:
+        """The same for a switch that is tripped."""
+        ends = np.array([[map_from_base.x_m, map_from_base.y_m, map_from_base.yaw_rad]] * 2)
+        if self._has_moved(source, ends[0], frozenset([touch.switch.line])):
+            self._keep(KeptRound(source, key, _seen_from(key_pose, ends), touch), ends)
+
     def start_over(self, base: Iterable[tuple[int, int, bytes]] = ()) -> None:
         """Forget what was kept; base: tiles of the map that is there now."""
         self._kept, self._under_way = [], None
@@ -293,8 +300,10 @@ class Redrawer:
                     continue
                 if isinstance(kept, KeptSweep):
                     layer.take_sweep(kept.sensor, kept.scan(), kept.poses(at, self._mounts[kept.sensor]))
-                else:
+                elif isinstance(kept.heard, Round):
                     layer.take_round(kept.sensor, kept.heard, Pose2(*at[0].tolist()))
+                else:
+                    layer.take_touch(kept.sensor, kept.heard, Pose2(*at[0].tolist()))
 
     @property
     def kept(self) -> int:
@@ -319,8 +328,10 @@ def draw(grid: OccupancyGrid, kept: Kept, ends: F64, mounts: Mapping[str, F64]) 
     try:
         if isinstance(kept, KeptSweep):
             insert_sweep(grid, kept.scan(), kept.poses(ends, mounts[kept.sensor]))
-        else:
+        elif isinstance(kept.heard, Round):
             insert_round(grid, kept.sensor, kept.heard, Pose2(*ends[0].tolist()))
+        else:
+            insert_touch(grid, kept.heard, Pose2(*ends[0].tolist()))
     except ValueError:  # farther or longer than a grid can hold: it was not drawn the first time either
         return
 

@@ -30,7 +30,7 @@ from mapping.odometry import OdometryState
 from mapping.pose_buffer import PoseBuffer
 from mapping.scan import Scan
 from service.background import Submit
-from service.fusion import Located, Round, StoredTile, compose_many, located_by_odometry
+from service.fusion import Located, Round, StoredTile, Touch, compose_many, located_by_odometry
 from service.outputs import DocumentOut, Output
 from service.redraw import Redrawer
 from service.slam_store import Keeper, Stored, stored_of
@@ -128,11 +128,14 @@ class SlamLocaliser:
             ends = self._ends(scan, odom_from_base)
             self._redrawer.keep_sweep(sensor, scan, key, self._slam.key_pose(key), ends)
 
-    def take_round(self, source: str, heard: Round, odom_from_base: Pose2) -> None:
+    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> None:
         if self._redrawer is not None and self._update is not None and self._slam.keys:
             key = self._slam.keys - 1
             pose = self._map_from_odom @ odom_from_base
-            self._redrawer.keep_round(source, heard, key, self._slam.key_pose(key), pose)
+            if isinstance(heard, Round):
+                self._redrawer.keep_round(source, heard, key, self._slam.key_pose(key), pose)
+            else:
+                self._redrawer.keep_touch(source, heard, key, self._slam.key_pose(key), pose)
 
     def map_from_odom(self) -> Pose2:
         return self._map_from_odom

@@ -27,8 +27,9 @@ from mapping.localise.closures import Closure
 from mapping.localise.kept_sweeps import KeptSweep
 from mapping.localise.slam import SlamState
 from mapping.localise.views import View, ViewStore, table_of
-from service.fusion import Cone, Round
+from service.fusion import Cone, Round, Touch
 from service.redraw import Kept, KeptRound, RedrawState
+from service.sensors import Switch
 
 F64 = NDArray[np.float64]
 Tile = tuple[int, int, bytes]
@@ -224,6 +225,10 @@ def _kept_of(tile: Mapping[str, Any]) -> list[Kept]:
 
 def _round_document(kept: KeptRound) -> list[Any]:
     heard = kept.heard
+    if isinstance(heard, Touch):
+        at, switch = heard.switch.base_from_contact, heard.switch
+        place = (switch.line, at.x_m, at.y_m, at.yaw_rad, switch.width_m)
+        return [kept.sensor, kept.key, kept.in_key.tolist(), heard.stamp_ns, heard.tripped, place]
     cones = [
         (c.channel, c.base_from_transducer.x_m, c.base_from_transducer.y_m, c.base_from_transducer.yaw_rad, c.range_m)
         for c in heard.cones
@@ -233,6 +238,10 @@ def _round_document(kept: KeptRound) -> list[Any]:
 
 
 def _round_of(document: list[Any]) -> KeptRound:
+    if len(document) == 6:
+        sensor, key, in_key, stamp_ns, tripped, (line, x, y, yaw, width_m) = document
+        touch = Touch(int(stamp_ns), Switch(int(line), Pose2(x, y, yaw), width_m), tripped)
+        return KeptRound(sensor, int(key), np.array(in_key), touch)
     sensor, key, in_key, stamp_ns, cone_rad, range_min_m, range_max_m, cones = document
     heard = tuple(Cone(int(channel), Pose2(x, y, yaw), range_m) for channel, x, y, yaw, range_m in cones)
     return KeptRound(

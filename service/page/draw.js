@@ -148,6 +148,21 @@ export function drawTrail(g2, camera, trail) {
   g2.globalAlpha = 1;
 }
 
+// Pairs of places on the way that are the same place: what closes the loops of the map. Doubted ones are faint.
+export function drawLoops(g2, camera, graph) {
+  g2.strokeStyle = g2.fillStyle = colours.cone;
+  g2.lineWidth = 1.5;
+  for (const closure of graph.closures) {
+    const ends = [graph.keys[closure.from], graph.keys[closure.to]].map(([x, y]) => camera.toScreen(x, y));
+    g2.globalAlpha = 0.2 + 0.6 * closure.weight;
+    g2.beginPath();
+    for (const [px, py] of ends) g2.lineTo(px, py);
+    g2.stroke();
+    for (const [px, py] of ends) { g2.beginPath(); g2.arc(px, py, 2.5, 0, 2 * Math.PI); g2.fill(); }
+  }
+  g2.globalAlpha = 1;
+}
+
 export function compose(a, b) {
   const c = Math.cos(a.yaw), s = Math.sin(a.yaw);
   return { x: a.x + c * b.x - s * b.y, y: a.y + s * b.x + c * b.y, yaw: a.yaw + b.yaw };

@@ -21,6 +21,7 @@ class Robot {
     this.cones = new Map();
     this.polar = new Map();
     this.grid = new draw.GridImage();
+    this.graph = null;
     this.seen = new Map(); // when a device's newest reading came here
   }
 
@@ -31,6 +32,12 @@ class Robot {
     const last = this.trail.at(-1);
     if (!last || Math.hypot(pose.x - last.x, pose.y - last.y) >= TRAIL_STEP_M) this.trail.push(pose);
     if (this.trail.length > TRAIL_POINTS) this.trail.splice(0, TRAIL_POINTS / 10);
+  }
+
+  // After a correction the map lies elsewhere: the old trail does not fit it any more, the graph's way does.
+  setGraph(graph) {
+    if (this.graph && this.graph.epoch !== graph.epoch) this.trail = [];
+    this.graph = graph;
   }
 
   // The pose at a stamp: between the two kept around it, else the nearest.
@@ -54,7 +61,7 @@ const robots = new Map();
 let shown = null;
 let changed = true;
 const camera = new draw.Camera($("map"));
-const layers = { grid: true, scan: true, sonar: true, sectors: true, trail: true };
+const layers = { grid: true, scan: true, sonar: true, sectors: true, trail: true, loops: true };
 let follow = false;
 let ringMap = null;
 
@@ -92,6 +99,7 @@ const HANDLERS = [
   [/^map\/grid\/update$/, (robot, payload, attachment) => {
     if (epochOf(attachment) === robot.grid.epoch) robot.grid.update(cdr.occupancyGridUpdate(payload));
   }],
+  [/^map\/graph$/, (robot, payload) => robot.setGraph(json(payload))],
   [/^health\/json$/, (robot, payload) => takeHealth(robot, json(payload))],
   [/^info$/, (robot, payload) => { robot.info = json(payload); }],
 ];
@@ -277,7 +285,11 @@ function drawMap(robot) {
   frameWhenKnown(robot);
   if (follow && robot.pose) { camera.x = robot.pose.x; camera.y = robot.pose.y; }
   if (layers.grid) robot.grid.draw(g2, camera);
-  if (layers.trail) draw.drawTrail(g2, camera, robot.trail);
+  if (layers.trail) {
+    if (robot.graph) draw.drawTrail(g2, camera, robot.graph.keys.map(([x, y]) => ({ x, y })));
+    draw.drawTrail(g2, camera, robot.trail);
+  }
+  if (layers.loops && robot.graph) draw.drawLoops(g2, camera, robot.graph);
   if (robot.pose) {
     if (layers.sonar) drawCones(g2, robot);
     if (layers.scan) drawScans(g2, robot);

@@ -19,9 +19,11 @@ from mapping.grids.rolling import RollingGrid
 from mapping.localise.kept_sweeps import kept_sweep
 from mapping.scan import Scan
 from service.background import Background, at_once
-from service.fusion import Cone, Round
+from service.fusion import Cone, Round, Touch
 from service.layers import BuildingLayer, RollingLayer, insert_sweep
-from service.redraw import DELAY_NS, DELAY_NS_PER_KEPT, Redrawer
+from service.redraw import DELAY_NS, DELAY_NS_PER_KEPT, KeptRound, Redrawer
+from service.sensors import Switch
+from service.slam_store import _kept_of, _kept_tile, _unpack
 
 F64 = NDArray[np.float64]
 T = TypeVar("T")
@@ -175,6 +177,29 @@ def test_sonar_rounds_move_too() -> None:
     redrawer.take_up(1 << 60, keys)
     np.testing.assert_array_equal(layer.grid.patch().cells, before)
     assert layer.grid.patch().col0 > 40.0 / 0.05 + 64
+
+
+def test_what_was_touched_moves_too_and_is_stored() -> None:
+    layer = building("front", "bumper")
+    redrawer = redrawer_of(layer)
+    touch = Touch(7, Switch(3, Pose2(0.3, 0.0), 0.2), True)
+    pose = Pose2(*ends_at(FAR_KEY, 0.0)[0].tolist())
+    redrawer.keep_touch("bumper", touch, FAR_KEY, Pose2(*KEYS[FAR_KEY].tolist()), pose)
+    layer.take_touch("bumper", touch, pose)
+    redrawer.corrected(0, moved_keys(1.0))
+    redrawer.take_up(1 << 60, moved_keys(1.0))
+    moved = Pose2(*moved_keys(1.0)[FAR_KEY].tolist())
+    alone = building("bumper")
+    alone.take_touch("bumper", touch, moved)
+    felt = moved.apply(np.array([[0.325, 0.0]]))
+    np.testing.assert_array_equal(layer.grid.probability_at(felt), alone.grid.probability_at(felt))
+    assert layer.grid.probability_at(felt)[0] > 0.65
+    assert not layer.grid.probability_at(pose.apply(np.array([[0.325, 0.0]])))[0] > 0.5  # NaN: unknown
+    (kept,) = redrawer.state().kept
+    assert isinstance(kept, KeptRound)
+    (again,) = _kept_of(_unpack(_kept_tile([kept])))
+    assert isinstance(again, KeptRound)
+    assert (again.sensor, again.key, again.heard) == (kept.sensor, kept.key, kept.heard)
 
 
 def test_a_job_that_fails_leaves_the_map_and_is_counted(caplog: pytest.LogCaptureFixture) -> None:
