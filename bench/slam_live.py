@@ -34,6 +34,7 @@ from service.background import Background
 from service.config import Config
 from service.fusion import Fusion
 from service.outputs import HealthOut, Output, PoseOut
+from service.redraw import Redrawer
 from service.slam_live import SlamLocaliser
 from service.worker import Worker
 from sim_devices.floor_plan import load_floor_plan
@@ -127,10 +128,8 @@ def measure(seconds: float) -> dict[str, float]:
 
     sensors = assemble.sensors(CONFIG)
     maps = assemble.maps(CONFIG, sensors)
-    localiser = assemble.localiser(CONFIG, sensors, maps, Pose2(), submit)
-    assert isinstance(localiser, SlamLocaliser)
-    localiser.__class__ = Metered
-    assert isinstance(localiser, Metered)
+    redrawer = Redrawer(maps.grids, maps.building, {"front": Pose2(0.2, 0.0, 0.0)}, submit=submit)
+    localiser = Metered({"front"}, submit=submit, redrawer=redrawer)
     fusion = Fusion(assemble.parts(CONFIG, sensors, maps, localiser))
     begun_ns = time.monotonic_ns() + 200 * MS
     told: list[tuple[int, int]] = []
