@@ -46,6 +46,7 @@ LINE_RATES = (19200, 38400, 57600, 115200, 250000, 500000, 750000)
 USB_RATE_BPS = 8_000_000  # full-speed CDC moves about 0.8 MB/s
 TCP_RATE_BPS = 100_000_000
 BLOCK = 64
+WAKING = frozenset((b"BM", b"MD", b"MS", b"ME", b"GD", b"GS", b"GE"))
 ALWAYS_OBEYED = frozenset((b"TM", b"QT", b"RS", b"RT", b"%ST"))  # in time mode, too
 REBOOT_S = 0.5
 REBOOT_WINDOW_NS = SECOND_NS
@@ -387,6 +388,7 @@ class HokuyoLaser:
         self._scip1 = self._start_in_scip1
         self._slower_percent = 0
         self._period_ns = round(self.profile.period_ns / self._speed_share)
+        self._asleep = False
         self._turn_zero_ns = self._boot_done_ns + self._spin_up_ns
         self._wire = PacedWire(self._base_rate_bps, now_ns)
         self._buffer = bytearray()
@@ -451,10 +453,10 @@ class HokuyoLaser:
         hasty = self.refuse_hasty and line == self._last_command and not self._wire.is_empty
         self._last_command = line
         command, semicolon, free = line.partition(b";")
-        symbol = b"%ST" if line.startswith(b"%ST") else command[:2]
+        symbol = line[:3] if line[:3] in (b"%ST", b"%SL") else command[:2]
         handler = self._handlers.get(symbol)
-        if symbol == b"%ST" and self.link == "tcp":
-            handler = self._short_state
+        if self.link == "tcp" and symbol in (b"%ST", b"%SL"):
+            handler = self._short_state if symbol == b"%ST" else self._sleep
         if len(free) > MAX_FREE_STRING:
             self._answer(line, "0G", now_ns)
         elif not FREE_STRING.issuperset(free):
@@ -464,6 +466,9 @@ class HokuyoLaser:
         elif hasty:
             self._answer(line, "0B", now_ns)
         else:
+            if self._asleep and symbol in WAKING:
+                self._asleep = False
+                self._turn_zero_ns = now_ns + self._spin_up_ns
             handler(command, semicolon + free, now_ns)
 
     def _obey_scip1(self, line: bytes, now_ns: int) -> None:
@@ -527,10 +532,19 @@ class HokuyoLaser:
         if self._sized(command, free, 3, now_ns):
             self._answer(command + free, "00", now_ns, sealed(self._state_code(now_ns)))
 
+    def _sleep(self, command: bytes, free: bytes, now_ns: int) -> None:
+        """Laser and motor off until it is asked to measure."""
+        if self._sized(command, free, 3, now_ns):
+            self._stop()
+            self._asleep = True
+            self._answer(command + free, "00", now_ns)
+
     def _state_code(self, now_ns: int) -> bytes:
-        """Three digits: 000 standby, 001 booting, 002 time mode, 003 laser on, 004 streaming, 900 error."""
+        """Three digits: 000 standby, 001 booting, 002 time mode, 003 laser on, 004 streaming, 005 asleep, 900 error."""
         if self._trouble is not None:
             return b"900"
+        if self._asleep:
+            return b"005"
         if self._time_mode:
             return b"002"
         if self._stream is not None:

@@ -29,6 +29,7 @@ import serial
 
 from sim_devices.attach import Attachment, PtyLink, TcpLink
 from sim_devices.device import F64, ByteDevice, Mount
+from sim_devices.laser_hokuyo import PROFILES, HokuyoLaser
 from sim_devices.laser_ldrobot import LdLidar
 from sim_devices.laser_rplidar import RPLIDAR_PROFILES, RpLidar
 from sim_devices.laser_sick_cola import SickColaLaser
@@ -224,3 +225,30 @@ def test_makers_driver_starts_a_tim() -> None:
     assert "sEA LMDscandata" in out
     assert "sFA" not in out
     assert link.counters.sent_bytes > 5 * 3374
+
+
+@needs("hokuyolx")
+def test_hokuyolx_over_tcp() -> None:
+    """Time synchronisation, information, single scans, streams, filters and every change of state."""
+    laser, link = HokuyoLaser(Room(), profile=PROFILES["ust-10lx"], link="tcp"), TcpLink(0)
+    loop = Attachment()
+    loop.add("laser", laser, link)
+    with loop:
+        time.sleep(2.5)
+        host: Any = importlib.import_module("hokuyolx").HokuyoLX(addr=("127.0.0.1", link.port), convert_time=False)
+        assert host.version()["PROT"].startswith("SCIP 2")
+        assert host.sensor_parameters()["AMAX"] == 1080
+        bearing = np.radians((np.arange(1081) - 540) * 0.25)
+        true_mm = 1000.0 * Room().beam_ranges(Mount(), bearing, np.zeros(1081), 30.0)
+        for _, scan in (host.get_dist(), (0, host.get_intens()[1][:, 0])):
+            assert np.abs(scan - true_mm).mean() < 1000.0 * NOISE_M
+        assert [len(each) for each in host.iter_dist(4)] == [3] * 4
+        assert len(list(host.iter_intens(2, skips=1))) == 2
+        host.standby()
+        assert host.laser_state()[0] == 0
+        host.sleep()
+        assert host.laser_state()[0] == 5
+        assert host.activate()[0] == 0
+        host.partial_reset()
+        host.reset()
+        host.close()

@@ -560,3 +560,18 @@ def test_long_pause_between_steps_neither_floods_nor_hangs() -> None:
     bench.now_ns += 5 * SECOND
     late = bench.laser.step(bench.now_ns, b"")
     assert 190 <= len(reports(late)) <= 202
+
+
+def test_sleep_turns_all_off_until_it_is_asked_to_measure() -> None:
+    bench = Bench(UST_10LX, link="tcp")
+    bench.wait(1.0)
+    assert bench.ask(b"BM\n") == b"BM\n00P\n\n"
+    assert bench.ask(b"%SL\n") == b"%SL\n00P\n\n"
+    assert not bench.laser.laser_is_on
+    assert b"\n005" in bench.ask(b"%ST\n")
+    bench.ask(b"BM\n")
+    assert b"\n005" not in bench.ask(b"%ST\n")
+
+
+def test_only_devices_on_a_network_sleep() -> None:
+    assert b"\n0E" in Bench(UTM_30LX).ask(b"%SL\n")
