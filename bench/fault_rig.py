@@ -215,6 +215,11 @@ class Rig:
             if name == source and isinstance(item, DeviceEvent) and item.stamp_ns >= since_ns
         ]
 
+    def link_of(self, source: str) -> MemoryLink:
+        """The wire of a source."""
+        (wire,) = (wire for wire in assemble.wires(self.config) if source in wire.conversations)
+        return self._link_of(wire)
+
     def is_running(self, source: str) -> bool:
         return self.health()[source].state is LinkState.RUNNING
 
