@@ -2,8 +2,8 @@
 
     python -m bench.parsers       a table; exit code 1 below 5,000 frames a second or above 50 ms
 
-The frames are what the emulated devices sent to the daemon's drivers for two seconds (bench/fault_rig.py); the bad bytes
-are noise, the same frames with one byte in twenty changed, and the fillers that begin a frame again and again.
+The frames are what the emulated devices sent to the daemon's drivers for two seconds (bench/fault_rig.py); the bad
+bytes are noise, the same frames with one byte in twenty changed, and what begins a frame again and again.
 """
 
 from __future__ import annotations

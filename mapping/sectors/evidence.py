@@ -91,6 +91,7 @@ class Evidence:
         self._count = count
         self._limits = limits
         self._channels: dict[tuple[int, int], _Channel] = {}
+        self._touched: dict[tuple[int, int], Finding] = {}  # of switches: what each would say if it were tripped
         self._heard = [not wait_for_sources] * len(sources)
         self._nothing_held = (
             np.full(count, np.inf),
@@ -135,13 +136,23 @@ class Evidence:
         if (at, channel) not in self._channels:
             self.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
 
-    def doubt(self, source: str, channel: int) -> None:
-        """What this channel said is stale from now on, until it speaks again."""
-        self._channels[self.index(source), channel].dead = True
+    def feel(self, source: str, channel: int, touched: Finding, *, tripped: bool | None, stamp_ns: int) -> None:
+        """Take a switch. touched: what it says when it is tripped; else it says nothing, and None that it is stale."""
+        at = self.index(source)
+        nothing_m, nowhere, *_ = self._nothing_held
+        none = np.zeros(self._count)
+        clear = Finding(nothing_m, nowhere, nowhere, none, none.astype(bool))
+        self._touched[at, channel] = touched
+        self.revise(source, channel, clear if tripped is False else touched, stamp_ns=stamp_ns, looked=None)
+        if tripped is None:
+            self._channels[at, channel].dead = True
 
     def lost(self, source: str) -> None:
         """The device is gone: all it said is stale from now on, until each channel speaks again."""
         at = self.index(source)
+        for (owner, number), touched in self._touched.items():
+            if owner == at:  # nobody knows any more whether it is touched
+                self._channels[owner, number].finding = touched
         for channel in self._channels.values():
             if channel.source == at:
                 channel.dead = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -83,7 +82,6 @@ class PolarSectors:
         self._footprint = checked_polygon(footprint) if footprint is not None and self_filter else None
         self._frame = _Wedges(self.edges_rad, sector_rad, range_max_m, self._outline)
         self._spacing = SpacingMemory()
-        self._contacts: dict[tuple[str, int], tuple[Finding, int]] = {}  # what each would say if it were touched
         self._heard = lru_cache(cones_remembered(len(self.edges_rad) - 1))(self._find_in_cone)
         self._evidence = Evidence(
             count=len(self.edges_rad) - 1,
@@ -193,21 +191,12 @@ class PolarSectors:
         """
         self._evidence.index(source)
         line = touched_line(self._virtual_from_base @ base_from_contact, width_m)
-        count = len(self.edges_rad) - 1
-        nowhere = np.full(count, np.nan)
-        clear = Finding(np.full(count, np.inf), nowhere, nowhere, np.zeros(count), np.zeros(count, dtype=bool))
         nearest_m, at_rad = self._frame.nearest(line)
-        touched = replace(clear, obstacle_m=nearest_m, u=at_rad, v=at_rad)
-        self._contacts[source, channel] = (touched, stamp_ns)
-        self._evidence.revise(source, channel, clear if tripped is False else touched, stamp_ns=stamp_ns, looked=None)
-        if tripped is None:
-            self._evidence.doubt(source, channel)
+        touched = Finding(nearest_m, at_rad, at_rad, np.zeros(len(at_rad)), np.zeros(len(at_rad), dtype=bool))
+        self._evidence.feel(source, channel, touched, tripped=tripped, stamp_ns=stamp_ns)
 
     def lost(self, source: str) -> None:
         """The device is gone: its evidence is stale now, not only when its time is up."""
-        for (owner, channel), (touched, stamp_ns) in self._contacts.items():
-            if owner == source:  # nobody knows any more whether it is touched
-                self._evidence.revise(source, channel, touched, stamp_ns=stamp_ns, looked=None)
         self._evidence.lost(source)
         self._spacing.forget(source)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -65,7 +64,6 @@ class RectSectors:
             raise ValueError(f"{self._shape[0]} x {self._shape[1]} sectors are too many: enlarge sector_m")
         self._raster = _Raster(self.x_edges_m, self.y_edges_m, sector_m, Outline(footprint, base_from_sensor))
         self._spacing = SpacingMemory()
-        self._contacts: dict[tuple[str, int], tuple[Finding, int]] = {}  # what each would say if it were touched
         self._heard = lru_cache(cones_remembered(self._shape[0] * self._shape[1]))(self._find_in_cone)
         self._evidence = Evidence(
             count=self._shape[0] * self._shape[1],
@@ -158,28 +156,15 @@ class RectSectors:
         tripped: bool | None,
         stamp_ns: int,
     ) -> None:
-        """Take a bumper or cliff switch. tripped: an obstacle along it; not tripped: nothing, it frees no sector.
-
-        None: it does not answer; its sectors are stale, as they are once the source is lost. base_from_contact: its
-        middle, looking outwards.  width_m: its length across.  Raises ValueError for an unknown source.
-        """
+        """Take a bumper or cliff switch; as PolarSectors.update_contact."""
         self._evidence.index(source)
         line = touched_line(self._virtual_from_base @ base_from_contact, width_m)
-        count = self._shape[0] * self._shape[1]
-        nowhere = np.full(count, np.nan)
-        clear = Finding(np.full(count, np.inf), nowhere, nowhere, np.zeros(count), np.zeros(count, dtype=bool))
         nearest_m, x, y = self._raster.along(line)
-        touched = replace(clear, obstacle_m=nearest_m, u=x, v=y)
-        self._contacts[source, channel] = (touched, stamp_ns)
-        self._evidence.revise(source, channel, clear if tripped is False else touched, stamp_ns=stamp_ns, looked=None)
-        if tripped is None:
-            self._evidence.doubt(source, channel)
+        touched = Finding(nearest_m, x, y, np.zeros(len(x)), np.zeros(len(x), dtype=bool))
+        self._evidence.feel(source, channel, touched, tripped=tripped, stamp_ns=stamp_ns)
 
     def lost(self, source: str) -> None:
         """The device is gone: its evidence is stale now, not only when its time is up."""
-        for (owner, channel), (touched, stamp_ns) in self._contacts.items():
-            if owner == source:  # nobody knows any more whether it is touched
-                self._evidence.revise(source, channel, touched, stamp_ns=stamp_ns, looked=None)
         self._evidence.lost(source)
         self._spacing.forget(source)
 
