@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -82,6 +83,7 @@ if TYPE_CHECKING:
     from mapping.planes.extract import PlaneRules
     from service.background import Submit
     from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
+    from service.map_localiser import KnownMapLayer
     from service.map_makers import MapMaker
     from service.mavlink_out import MavlinkOut
     from service.redraw import OnRedrawn
@@ -487,7 +489,9 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
 
     building = None
     grids: list[GridLayer] = []
-    if config.grid.enabled:
+    if config.localise.mode == "map":
+        grids.append(_known_map(config, found))
+    elif config.grid.enabled:
         building = BuildingLayer(
             OccupancyGrid(resolution_m=config.grid.resolution_m, model=config.grid.model),
             _sources(config, config.grid.sources, found),
@@ -509,6 +513,15 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
     if config.artos.enabled:
         grids.append(_artos_map(config, [layer for layer in sectors if isinstance(layer, PolarLayer)]))
     return Maps(sectors, tuple(grids), building)
+
+
+def _known_map(config: Config, found: Mapping[str, Sensor]) -> KnownMapLayer:
+    """The given map of [localise]. Trouble if its file cannot be read."""
+    from service.map_localiser import KnownMapLayer, read_map
+
+    lasers = frozenset(name for name, sensor in found.items() if isinstance(sensor, Laser) and not sensor.tilts)
+    path = Path(config.localise.map or "").expanduser()
+    return KnownMapLayer(read_map(path), lasers & _sources(config, config.localise.sources, found), name=path.name)
 
 
 def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
@@ -662,6 +675,12 @@ def localiser(
         for name, sensor in found.items()
         if isinstance(sensor, Laser) and not sensor.tilts
     }
+    if config.localise.mode == "map":
+        from service.map_localiser import KnownMapLayer, KnownMapLocaliser
+
+        known = next(layer for layer in made.grids if isinstance(layer, KnownMapLayer))
+        start = None if config.localise.start is None else pose_of(config.localise.start)
+        return KnownMapLocaliser(known.patch, known.sources, submit=submit, start=start, name=known.name)
     matched = lasers.keys() & _sources(config, config.slam.sources, found)
     if not config.slam.enabled or not matched:
         return OdometryOnly(start_pose)
@@ -757,7 +776,11 @@ def warm_up(config: Config) -> None:
         from mapping.planes.warm_up import warm_up as warm_up_planes
 
         warm_up_planes()
-    if config.slam.enabled and any(isinstance(sensor, Laser) for sensor in found.values()):
+    if config.localise.mode == "map":
+        from mapping.localise.warm_up import warm_up_in_map
+
+        warm_up_in_map()
+    elif config.slam.enabled and any(isinstance(sensor, Laser) for sensor in found.values()):
         from mapping.localise.warm_up import warm_up as warm_up_slam
 
         warm_up_slam()

@@ -38,6 +38,7 @@ from service.config_maps import (
     Grid,
     LineMapSettings,
     LocalGrid,
+    LocaliseIn,
     PlaneMapSettings,
     SectorMaps,
     SlamLive,
@@ -69,6 +70,7 @@ class Config(Section):
     planes: PlaneMapSettings = Field(default=PlaneMapSettings(), description="Planes of tilting lasers.")
     topo: TopoMapSettings = Field(default=TopoMapSettings(), description="Regions of free space and ways between them.")
     slam: SlamLive = Field(default=SlamLive(), description="Where the robot is, by laser scans.")
+    localise: LocaliseIn = Field(default=LocaliseIn(), description="Finding the robot in a given map.")
     alignment: Alignment = Field(default=Alignment(), description="How long readings wait for each other.")
     network: Network = Field(default=Network(), description="The Zenoh router.")
     ros: Ros = Field(default=Ros(), description="ROS 2 beside our own keys.")
@@ -270,6 +272,7 @@ def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
         (("local_grid",), _table(data, "local_grid")),
         (("lines",), _table(data, "lines")),
         (("slam",), _table(data, "slam")),
+        (("localise",), _table(data, "localise")),
     ):
         for reference in _texts(table.get("sources")):
             section, dot, name = reference.rpartition(".")

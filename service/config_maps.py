@@ -136,6 +136,23 @@ class SlamLive(Section):
     sources: tuple[Reference, ...] | None = Field(default=None, description="Lasers that are matched; default: all.")
 
 
+class LocaliseIn(Section):
+    """Localisation in a given map, which is only read: no grid is drawn, no store written, [slam] is left out."""
+
+    mode: Literal["off", "map"] = Field(default="off", description="map: find the robot in a given map.")
+    map: str | None = Field(default=None, description="The map's file: a map server's .yaml or a .umfeld.")
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Lasers that are matched; default: all.")
+    start: PlanePose | None = Field(
+        default=None, description="A hint where the robot begins; default: anywhere in the map."
+    )
+
+    @model_validator(mode="after")
+    def _has_a_map(self) -> LocaliseIn:
+        if self.mode == "map" and not self.map:
+            raise ValueError('mode = "map" needs map = "FILE.yaml" (or .umfeld): the map to find the robot in')
+        return self
+
+
 class Alignment(Section):
     """How long readings wait for each other."""
 

@@ -187,6 +187,11 @@ class Daemon:
         self._readers = [wire.reader(sink, self._clock.now_ns, self._recorder.tap(wire.name)) for wire in wires]
         by_name = {reader.name: reader for reader in self._readers}
         self._mavlink = assemble.mavlink_out(config, self._sensors, by_name, self._clock.now_ns)
+        if config.localise.mode == "map":
+            from service.map_localiser import KnownMapLocaliser, relocalise
+
+            assert isinstance(localiser, KnownMapLocaliser)
+            self._publisher.calls.register("relocalise", partial(relocalise, localiser, self._worker.ask))
         self._publisher.calls.register("record_start", self._on_record_start)
         self._publisher.calls.register("record_stop", lambda _arguments: self._end_recording())
         self._publisher.calls.register("record_status", lambda _arguments: self._recorder.status())
@@ -213,7 +218,7 @@ class Daemon:
     # --- parts
 
     def _open_store(self) -> MapStore | None:
-        if not self._config.store.enabled or not self._config.grid.enabled:
+        if not self._config.store.enabled or not self._config.grid.enabled or self._config.localise.mode == "map":
             return None
         path = self._config.store_path()
         store = self._parts.enter_context(MapStore.open(path, wall_ns=self._wall_ns))

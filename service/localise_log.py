@@ -19,8 +19,9 @@ from mapping.grids.patch import GridPatch
 from mapping.localise.in_map import InMapSettings, Located, MapLocaliser, SearchResult, State
 from mapping.localise.known_map import BEAMS, FARTHEST_M, KnownMap, digest_of, known_map, points_of
 from service.errors import WrongUsage
-from service.export import load_pgm_yaml, patch_of, pixels_of
+from service.export import pixels_of
 from service.files import Receipt, write_whole
+from service.map_localiser import fields_of, read_map
 
 Progress = Callable[[int, int], None]
 
@@ -41,16 +42,6 @@ class LocalisedLog:
     seconds: float
     digest_before: str
     digest_after: str
-
-
-def read_map(path: Path) -> GridPatch:
-    """The grid of a map server's pair (.yaml) or of a map file (.umfeld), on our lattice; turned origins are turned."""
-    if path.suffix.lower() in (".yaml", ".yml"):
-        return patch_of(load_pgm_yaml(path))
-    from service.store import MapStore, occupancy_patch
-
-    with MapStore.open(path, wall_ns=lambda: 0, read_only=True) as store:
-        return occupancy_patch(store)
 
 
 def prepared(patch: GridPatch, path: Path) -> KnownMap:
@@ -135,41 +126,6 @@ def rows_of(run: LocalisedLog) -> list[dict[str, object]]:
         {"stamp": scan.stamp_text, "s": round(scan.stamp_s - run.scans[0].stamp_s, 3), **fields_of(located)}
         for scan, located in zip(run.scans, run.located)
     ]
-
-
-def fields_of(located: Located) -> dict[str, object]:
-    """What is known at a scan, as JSON values; metres and degrees, rounded."""
-    sigma = np.sqrt(np.diag(located.covariance))
-    pose = located.map_from_base
-    return {
-        "state": located.state.value,
-        "probability": round(located.probability, 4),
-        "pose": None if pose is None else _pose_fields(pose),
-        "sigma": None
-        if pose is None
-        else {
-            "x_m": round(float(sigma[0]), 4),
-            "y_m": round(float(sigma[1]), 4),
-            "yaw_deg": round(math.degrees(float(sigma[2])), 3),
-        },
-        "candidates": [
-            {
-                **_pose_fields(each.pose),
-                "share": round(each.share, 4),
-                "explained": round(each.explained, 3),
-                "through": round(each.through, 3),
-            }
-            for each in located.candidates
-        ],
-    }
-
-
-def _pose_fields(pose: Pose2) -> dict[str, float]:
-    return {
-        "x_m": round(pose.x_m, 4),
-        "y_m": round(pose.y_m, 4),
-        "yaw_deg": round(math.degrees(pose.yaw_rad), 3) + 0.0,
-    }
 
 
 def write_json(run: LocalisedLog, path: Path) -> Receipt:

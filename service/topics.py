@@ -19,6 +19,7 @@ JSON_LINES = "application/json;umfeld.lines.v1"
 JSON_GRAPH = "application/json;umfeld.graph.v1"
 JSON_PLANES = "application/json;umfeld.planes.v1"
 JSON_TOPO = "application/json;umfeld.topo.v1"
+JSON_LOCALISATION = "application/json;umfeld.localisation.v1"
 JSON_REPLY = "application/json;umfeld.reply.v1"
 
 _CHUNK = re.compile(r"[a-z0-9_-]+\Z")
@@ -240,6 +241,15 @@ MAP_GRAPH = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+LOCALISATION = Topic(
+    "localisation",
+    "umfeld.localisation.v1",
+    JSON_LOCALISATION,
+    "at most 5 Hz",
+    "Whether the robot knows its place in a given map: lost, searching or sure, how probable, and the candidates.",
+    Priority.DATA_HIGH,
+    cached=True,
+)
 MAP_PLANES = Topic(
     "map/planes",
     "umfeld.planes.v1",
@@ -316,6 +326,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_ARTOS,
     MAP_LINES,
     MAP_GRAPH,
+    LOCALISATION,
     MAP_PLANES,
     MAP_TOPO,
     HEALTH,

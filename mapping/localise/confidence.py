@@ -40,7 +40,7 @@ class Coefficients:
     fits: tuple[float, float, float]
 
 
-FITTED = Coefficients((3.49, 0.85, -1.76), (-4.18, 7.52, 1.68))
+FITTED = Coefficients((2.17, 0.76, -1.13), (-3.1, 7.27, 0.93))
 LEAD = (-6.0, 10.0)  # beyond, a lead says no more
 MOST_KEYS = 16
 

@@ -71,6 +71,7 @@ class InMapSettings:
     places: int = 40
     margin: float = 16.0
     carried: float = 10.0
+    doubted: float = 3.0
     search_s: float = 1.0
     search_sure_s: float = 4.0
     lag_s: float = 0.4
@@ -210,6 +211,11 @@ class Search:
         order = np.argsort(-hold(self.known, newest.points, poses, stride=stride).log, kind="stable")[: s.places]
         return SearchResult(self.number, newest.number, _led_back(self.known, s, self.keys, poses[order]))
 
+    def candidates(self, most: int = 8) -> tuple[Candidate, ...]:
+        """What run() finds, for people: the best first."""
+        crowd = _ranked(self.run().crowd, self.settings)
+        return _told(crowd, crowd.weight(self.settings), most)
+
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
@@ -272,13 +278,7 @@ class MapLocaliser:
         s, crowd = self.settings, self._crowd
         if not len(crowd):
             return Located(stamp_ns, self.state, 0.0, None, _anywhere(), (), self._evidence)
-        weight = crowd.weight(s)
-        share = np.exp(weight - weight.max())
-        share /= share.sum()
-        candidates = tuple(
-            Candidate(pose_of(crowd.poses[k]), float(share[k]), float(explained), float(through))
-            for k, (explained, through) in enumerate(zip(crowd.explained[:8, 0], crowd.through[:8, 0]))
-        )
+        candidates = _told(crowd, crowd.weight(s), 8)
         told = crowd.covariance[0] + np.diag([s.floor_m**2, s.floor_m**2, s.floor_rad**2])
         return Located(
             stamp_ns, self.state, self._probability, candidates[0].pose, told, candidates, self._evidence
@@ -337,16 +337,10 @@ class MapLocaliser:
         self._keys.appendleft(key)
         if len(self._crowd):
             crowd = _corrected(self.known, key.points, self._crowd, self.settings)
-            self._crowd = self._ranked(_with_evidence(self.known, key.points, crowd, self.settings, instead=instead))
+            self._crowd = _ranked(
+                _with_evidence(self.known, key.points, crowd, self.settings, instead=instead), self.settings
+            )
         self._judge_state()
-
-    def _ranked(self, crowd: _Crowd) -> _Crowd:
-        """Best first, one for each place, without those that are out of the running."""
-        weight = crowd.weight(self.settings)
-        order = np.argsort(-weight, kind="stable")
-        order = order[weight[order] >= weight[order[0]] - self.settings.margin]
-        crowd = crowd.rows(order)
-        return crowd.rows(apart(crowd.poses, metres=SAME_M, radians=SAME_RAD, most=self.settings.places))
 
     def _judge_state(self) -> None:
         s = self.settings
@@ -405,6 +399,14 @@ class MapLocaliser:
         self._handed_out = True
         return self._outstanding
 
+    def search_now(self, near: tuple[Pose2, float] | None = None) -> Search | None:
+        """A search by the key scans there are, beside the own ones; nothing changes. None before the first scan."""
+        return Search(-1, self.known, self.settings, tuple(self._keys), near) if self._keys else None
+
+    def abandon(self) -> None:
+        """The search that is due came to nothing."""
+        self._outstanding = None
+
     def is_due(self, stamp_ns: int) -> bool:
         """Whether a result must be applied before a scan of this stamp is added."""
         return self._outstanding is not None and stamp_ns >= self._due_ns
@@ -433,7 +435,7 @@ class MapLocaliser:
             crowd = replace(crowd, prior=np.full(len(crowd), -self.settings.carried))
         together = self._crowd.and_(crowd)
         if len(together):
-            self._crowd = self._ranked(together)
+            self._crowd = _ranked(together, self.settings)
             self._judge_state()
 
     # --- throwing away
@@ -449,7 +451,8 @@ class MapLocaliser:
         self._keys.clear()
         self._keys.append(newest)
         kept = [np.where(np.arange(self.settings.window) == 0, column, 0.0) for column in self._crowd.seen()]
-        self._crowd = _Crowd(self._crowd.poses, self._crowd.covariance, np.zeros(len(self._crowd)), *kept)
+        prior = np.where(np.arange(len(self._crowd)) == 0, self.settings.doubted, 0.0)
+        self._crowd = _Crowd(self._crowd.poses, self._crowd.covariance, prior, *kept)
         self._start_anew()
 
     def _start_anew(self) -> None:
@@ -464,6 +467,29 @@ class MapLocaliser:
 
 def _anywhere() -> F64:
     return np.diag([1e6, 1e6, math.pi**2])
+
+
+def _ranked(crowd: _Crowd, s: InMapSettings) -> _Crowd:
+    """Best first, one for each place, without those that are out of the running."""
+    if not len(crowd):
+        return crowd
+    weight = crowd.weight(s)
+    order = np.argsort(-weight, kind="stable")
+    order = order[weight[order] >= weight[order[0]] - s.margin]
+    crowd = crowd.rows(order)
+    return crowd.rows(apart(crowd.poses, metres=SAME_M, radians=SAME_RAD, most=s.places))
+
+
+def _told(crowd: _Crowd, weight: F64, most: int) -> tuple[Candidate, ...]:
+    """The first places, with their shares of the belief in all."""
+    if not len(crowd):
+        return ()
+    share = np.exp(weight - weight.max())
+    share /= share.sum()
+    return tuple(
+        Candidate(pose_of(crowd.poses[k]), float(share[k]), float(crowd.explained[k, 0]), float(crowd.through[k, 0]))
+        for k in range(min(most, len(crowd)))
+    )
 
 
 def _moved(crowd: _Crowd, step: Pose2, s: InMapSettings, *, blind_s: float = 0.0) -> _Crowd:

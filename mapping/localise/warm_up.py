@@ -7,6 +7,9 @@ import math
 import numpy as np
 
 from mapping.frames import Pose2
+from mapping.grids.patch import GridPatch
+from mapping.localise.in_map import MapLocaliser
+from mapping.localise.known_map import known_map, points_of
 from mapping.localise.scan_match import agreement, match_view
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.slam import Slam, SlamSettings
@@ -35,3 +38,21 @@ def warm_up() -> None:
         raster = raster_of(snapshot.views, rows, snapshot.poses, window_m=window_m)
         find_view(view, raster, Pose2(), window_m=window_m, turn_rad=0.1)
     slam.finish()
+
+
+def warm_up_in_map() -> None:
+    """Find a robot in a small room that is thrown away."""
+    cells = np.zeros((60, 80), dtype=np.int8)
+    cells[[0, -1], :] = cells[:, [0, -1]] = 100
+    localiser = MapLocaliser(known_map(GridPatch(0.05, 0, 0, cells)))
+    bearing = np.linspace(-math.pi, math.pi, 90, endpoint=False)
+    for step in range(3):
+        with np.errstate(divide="ignore"):
+            walls = np.minimum(1.5 / np.abs(np.sin(bearing)), 2.0 / np.abs(np.cos(bearing)))
+        points = points_of(bearing, walls, Pose2(), nearest_m=0.05, farthest_m=20.0, most=90)
+        if localiser.is_due(step * 2_000_000_000):
+            localiser.abandon()
+        localiser.add_scan(step * 2_000_000_000, points, Pose2(0.3 * step, 0.0, 0.0))
+        work = localiser.take_work()
+        if work is not None:
+            work.run()

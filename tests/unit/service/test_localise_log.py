@@ -17,7 +17,8 @@ from mapping.grids.patch import GridPatch
 from service.__main__ import main
 from service.errors import WrongUsage
 from service.export import MapImage, image_of, save_pgm_yaml
-from service.localise_log import localise_log, read_map, report_of, rows_of, trajectory_text
+from service.localise_log import localise_log, report_of, rows_of, trajectory_text
+from service.map_localiser import read_map
 
 DATA = os.environ.get("UMFELD_DATA", "")
 needs_data = pytest.mark.skipif(not DATA, reason="needs UMFELD_DATA")
