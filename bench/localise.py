@@ -247,7 +247,10 @@ def tracking(case: Case) -> dict[str, object]:
 def kidnapping(case: Case, count: int, samples: list[Sample]) -> dict[str, object]:
     """Jumps of robots that were sure and right: how long still sure of the wrong place, and when sure of the right."""
     pieces = starts_of(case, 4 * count, 20.0, seed=11)
-    wrong_s, longest_s, back_s, not_back = [], [], [], 0
+    wrong_s: list[float] = []
+    longest_s: list[float] = []
+    back_s: list[float] = []
+    not_back = 0
     for (first, end), (other, other_end) in zip(pieces[0::2], pieces[1::2]):
         if len(wrong_s) >= count or abs(other - first) < 50:
             continue

@@ -30,7 +30,7 @@ from mapping.scan import Scan
 from service.background import Submit
 from service.errors import Trouble
 from service.export import load_pgm_yaml, patch_of
-from service.fusion import Located, Round
+from service.fusion import Located, Round, StoredTile, Touch
 from service.outputs import DocumentOut, GridOut, Output
 from service.rpc import CallRefused
 
@@ -72,6 +72,9 @@ class KnownMapLayer:
         """The map is given: nothing is drawn."""
 
     def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
+        """Nothing is drawn."""
+
+    def take_touch(self, source: str, touch: Touch, map_from_base: Pose2) -> None:
         """Nothing is drawn."""
 
     def outputs(self, map_from_base: Pose2 | None, stamp_ns: int, now_ns: int) -> list[Output]:
@@ -140,8 +143,15 @@ class KnownMapLocaliser:
         if work is not None:
             self._pending = self._submit(work.run)
 
-    def take_round(self, source: str, heard: Round, odom_from_base: Pose2) -> None:
-        """Sonars are no help here."""
+    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> None:
+        """Sonars and switches are no help here."""
+
+    def is_placed(self) -> bool:
+        """Nothing is drawn into the map in any case; what is drawn around the robot needs no place."""
+        return True
+
+    def kept(self) -> None:
+        """Nothing is kept."""
 
     def map_from_odom(self) -> Pose2:
         return self._map_from_odom
@@ -162,7 +172,7 @@ class KnownMapLocaliser:
         covariance = self._placed.covariance if sure else _ANYWHERE
         return Located(self._placed.stamp_ns, self._map_from_odom, self._map_from_odom, covariance)
 
-    def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]]) -> None:
+    def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """Nobody can: there is no map service in this mode."""
 
     def outputs(self, now_ns: int) -> list[Output]:
@@ -305,13 +315,14 @@ def _hint_of(arguments: Mapping[str, Any]) -> tuple[Pose2, float] | None:
     if hint is None:
         return None
     radius = arguments.get("radius_m", 3.0)
-    values = [hint.get(name, 0.0) for name in ("x_m", "y_m", "yaw_deg")] if isinstance(hint, dict) else [None]
-    numbers = [*values, radius]
+    values = [hint.get(name, 0.0) for name in ("x_m", "y_m", "yaw_deg")] if isinstance(hint, dict) else [math.nan]
+    numbers: list[Any] = [*values, radius]
     if not all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in numbers):
         raise CallRefused('write {"hint": {"x_m": 12.5, "y_m": 3.0, "yaw_deg": 90}, "radius_m": 3}')
     if not 0.0 < radius <= 1000.0:
         raise CallRefused('"radius_m" must lie between 0 and 1000')
-    return Pose2(float(values[0]), float(values[1]), math.radians(values[2])), float(radius)
+    x_m, y_m, yaw_deg = (float(v) for v in numbers[:3])
+    return Pose2(x_m, y_m, math.radians(yaw_deg)), float(radius)
 
 
 def _pose_fields(pose: Pose2) -> dict[str, float]:

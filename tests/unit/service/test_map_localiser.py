@@ -155,7 +155,7 @@ def test_no_map_is_changed(tmp_path: Path) -> None:
     config = Config(localise=LocaliseIn(mode="map", map=str(tmp_path / "plan.yaml")))
     made = assemble.maps(config, {})
     assert made.building is None
-    assert [type(layer) for layer in made.grids] == [KnownMapLayer]
+    assert len(made.grids) == 1
     localiser = assemble.localiser(config, {}, made, Pose2(), at_once)
     assert isinstance(localiser, KnownMapLocaliser)
     layer = made.grids[0]
