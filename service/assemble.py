@@ -27,6 +27,7 @@ from drivers.readings import (
     RangeReading,
     RangeStatus,
     Reading,
+    RingReading,
     ScanReading,
     WheelReading,
 )
@@ -38,6 +39,7 @@ from service.config_base import PlanePose
 from service.config_devices import (
     SERIAL_NUMBER,
     SHARED_DRIVERS,
+    AliceRing,
     ArduinoContacts,
     ArduinoSonars,
     ArduinoWheels,
@@ -71,6 +73,7 @@ from service.sensors import (
     Contacts,
     Laser,
     PoseSource,
+    Ring,
     Sensor,
     Switch,
     Transducer,
@@ -411,6 +414,10 @@ def conversation_of(device: Device) -> Conversation[Any]:
             return MaxBotixConversation(
                 device.family, form=device.lines, channels=_channels(device), period_s=_maxbotix_period_s(device)
             )
+        case AliceRing():
+            from drivers.alice import AliceConversation
+
+            return AliceConversation(baud=device.baud_bps)
         case ArduinoWheels() | ArduinoSonars() | ArduinoContacts() | MavlinkWheels() | MavlinkSonars() | MavlinkPose():
             return _shares_of({"": device})[""]
         case _:
@@ -465,6 +472,8 @@ def _sensor_of(source: str, device: Device) -> Sensor:
             return Contacts(source, switches, round(1e9 / device.rate_hz), round(1e9 * device.hold_s))
         case MavlinkPose():
             return PoseSource(source)
+        case AliceRing():
+            return Ring(source)
         case _:
             raise TypeError(f"no sensor for {type(device).__name__}")
 
@@ -539,6 +548,10 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         lines = config.lines
         period_ns = round(lines.period_s * 1e9)
         makers.append(LineMaker(LineMap(), fed_by, period_ns=period_ns, min_seen=lines.min_scans))
+    if any(isinstance(sensor, Ring) for sensor in found.values()):
+        from service.alice_maker import AliceMaker
+
+        makers.append(AliceMaker())
     if config.topo.enabled and config.grid.enabled:
         from service.topo_maker import TopoMaker
 
@@ -772,6 +785,10 @@ def warm_up(config: Config) -> None:
         from mapping.lines.warm_up import warm_up as warm_up_lines
 
         warm_up_lines()
+    if config.rings:
+        from mapping.topology.warm_up import warm_up as warm_up_topology
+
+        warm_up_topology()
     if config.planes.enabled and config.mounts:
         from mapping.planes.warm_up import warm_up as warm_up_planes
 
@@ -815,3 +832,5 @@ def _pretended(sensor: Sensor, step: int, now_ns: int) -> Reading:
             return ContactReading(now_ns, lines)
         case PoseSource():
             return PoseReading(now_ns, 0.1 * step, 0.0, 0.0, step > 0)
+        case Ring():
+            return RingReading(now_ns, np.full(24, 0.5), np.zeros(24, dtype=np.bool_), 0.1 * step, 0.0, step > 0)

@@ -19,6 +19,7 @@ from service.config_around import Log, Mavlink, Network, RecordingSettings, Ros,
 from service.config_base import Name, Section
 from service.config_devices import (
     SHARED_DRIVERS,
+    AliceRing,
     ArduinoContacts,
     CanBus,
     Cia406Mount,
@@ -47,7 +48,7 @@ from service.config_maps import (
 from service.errors import WrongUsage
 
 SENSOR_SECTIONS = ("lasers", "sonars", "contacts")
-DEVICE_SECTIONS = (*SENSOR_SECTIONS, "wheels", "mounts", "poses")
+DEVICE_SECTIONS = (*SENSOR_SECTIONS, "wheels", "mounts", "poses", "rings")
 
 
 class Config(Section):
@@ -62,6 +63,7 @@ class Config(Section):
     wheels: dict[Name, WheelDevice] = Field(default={}, description="Wheel encoders by name.")
     mounts: dict[Name, Cia406Mount] = Field(default={}, description="Mounts that nod or turn a laser, by name.")
     poses: dict[Name, MavlinkPose] = Field(default={}, description="Other estimators of the robot's pose by name.")
+    rings: dict[Name, AliceRing] = Field(default={}, description="Robots with rings of light and touch, by name.")
     sectors: SectorMaps = Field(default=SectorMaps(), description="Sector maps.")
     grid: Grid = Field(default=Grid(), description="The grid of the whole building.")
     local_grid: LocalGrid = Field(default=LocalGrid(), description="The grid around the robot.")
@@ -91,8 +93,8 @@ class Config(Section):
     def source_name(self, section: str, name: str) -> str:
         """The one name of a device in keys and reports: its own, with its section before it if an earlier one has it.
 
-        lasers come before sonars, then contacts, wheels, mounts, poses: with [lasers.front] and [sonars.front] these
-        are `front` and `sonars-front`.
+        lasers come before sonars, then contacts, wheels, mounts, poses, rings: with [lasers.front] and [sonars.front]
+        these are `front` and `sonars-front`.
         """
         earlier = DEVICE_SECTIONS[: DEVICE_SECTIONS.index(section)]
         return f"{section}-{name}" if any(name in getattr(self, other) for other in earlier) else name
@@ -341,6 +343,10 @@ def _unused_faults(config: Config, data: Mapping[str, Any]) -> Iterator[Fault]:
     for name in config.poses:
         if config.drive.pose_source is None and "pose_source" not in _table(data, "drive"):
             yield Fault(("poses", name), f'no drive uses it; add pose_source = "{name}" to [drive]')
+    if config.rings and config.topo.enabled:
+        yield Fault(("topo", "enabled"), "map/topo is what the ring makes; leave [topo] out, or [rings.NAME]")
+    if len(config.rings) > 1:
+        yield Fault(("rings", sorted(config.rings)[1]), "a robot has one ring: map/topo is one map")
     polar = _table(data, "sectors", "polar")
     if config.mavlink.enabled and config.mavlink.map is None and len(polar) != 1:
         names = ", ".join(sorted(polar)) or "(none yet)"

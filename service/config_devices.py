@@ -634,6 +634,14 @@ class ArduinoContacts(Device):
         return self
 
 
+class AliceRing(Device):
+    """ALICE: rings of 24 photo and 24 touch sensors on a synchro drive, which makes the map of places: key map/topo."""
+
+    driver: Literal["alice"] = Field(description="Says that it is this kind of device.")
+    port: PortName = Field(description=_PORT)
+    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed.")
+
+
 class MavlinkPose(Device):
     """Where an autopilot's own estimator says the robot is: ODOMETRY. Named by pose_source of [drive]."""
 

@@ -39,6 +39,7 @@ from drivers.readings import (
     PoseReading,
     RangeStatus,
     Reading,
+    RingReading,
     ScanReading,
     WheelReading,
 )
@@ -50,8 +51,8 @@ from mapping.pose_buffer import GoneError, PoseBuffer
 from mapping.scan import Scan
 from service.align import WaitingRoom
 from service.mounts import TiltingLaser
-from service.outputs import OdomOut, Output, PolarOut, PoseOut, RangesOut, RectOut, ScanOut
-from service.sensors import AxleEncoder, Chain, Contacts, Laser, PoseSource, Sensor, Switch, Wheels
+from service.outputs import LookOut, OdomOut, Output, PolarOut, PoseOut, RangesOut, RectOut, ScanOut
+from service.sensors import AxleEncoder, Chain, Contacts, Laser, PoseSource, Ring, Sensor, Switch, Wheels
 
 F64 = NDArray[np.float64]
 StoredTile = tuple[int, int, bytes]
@@ -351,6 +352,8 @@ class Fusion:
             case PoseSource(), PoseReading():
                 newer = self._is_newer(source, item.stamp_ns, now_ns)
                 return self._on_pose(sensor, item, now_ns) if newer else []
+            case Ring(), RingReading():
+                return self._on_look(sensor, item) if self._is_newer(source, item.stamp_ns, now_ns) else []
             case Contacts(), ContactReading():
                 newer = self._is_newer(source, item.stamp_ns, now_ns)
                 return self._on_contacts(sensor, item, now_ns) if newer else []
@@ -542,6 +545,11 @@ class Fusion:
             return [self._tell(index, now_ns) for index in fed]
         self._sectors_untold.update(fed)
         return []
+
+    def _on_look(self, ring: Ring, reading: RingReading) -> list[Output]:
+        way_m = (reading.ahead_m, reading.left_m)
+        touch = reading.touch.astype(np.float64)
+        return [LookOut(ring.name, reading.stamp_ns, reading.light, touch, way_m, reading.continuous)]
 
     # --- wheels
 

@@ -27,7 +27,7 @@ from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service.errors import Trouble
 from service.fusion import Round, Touch
-from service.outputs import CloudOut, GridOut, GridUpdateOut, Output, PoseOut
+from service.outputs import CloudOut, GridOut, GridUpdateOut, LookOut, Output, PoseOut
 
 log = logging.getLogger(__name__)
 
@@ -111,6 +111,14 @@ class MadeOfClouds(Protocol):
         """One nod or turn of a mount."""
 
 
+@runtime_checkable
+class MadeOfLooks(Protocol):
+    """A maker that wants the looks of a ring, every one of them."""
+
+    def take_look(self, look: LookOut) -> None:
+        """One look."""
+
+
 @dataclass(slots=True)
 class _Desk:
     """What the thread remembers of one maker."""
@@ -134,6 +142,7 @@ class MapMakers:
         self._redrawn: Sequence[Callable[[], Sweep]] | None = None
         self._grids: deque[GridOut | GridUpdateOut] = deque()
         self._clouds: deque[CloudOut] = deque()
+        self._looks: deque[LookOut] = deque()
         self._asked: deque[tuple[Callable[[], object], threading.Event, list[object]]] = deque()
         self._changed = threading.Condition()
         self._stopping = False
@@ -141,7 +150,13 @@ class MapMakers:
         self._mirror = _Mirror()
         self._pose: PoseOut | None = None
         self._complained: set[str] = set()
-        self.counts = {"makers.sweeps_lost": 0, "makers.grids_lost": 0, "makers.clouds_lost": 0, "makers.errors": 0}
+        self.counts = {
+            "makers.sweeps_lost": 0,
+            "makers.grids_lost": 0,
+            "makers.clouds_lost": 0,
+            "makers.looks_lost": 0,
+            "makers.errors": 0,
+        }
 
     @property
     def sources(self) -> frozenset[str]:
@@ -184,6 +199,12 @@ class MapMakers:
     def take_output(self, output: Output) -> None:
         """Everything that is published passes here; grids, clouds and poses are of use. Never blocks."""
         match output:
+            case LookOut():
+                with self._changed:
+                    self._looks.append(output)
+                    if len(self._looks) > SWEEPS_WAITING_MAX:
+                        self._looks.popleft()
+                        self.counts["makers.looks_lost"] += 1
             case CloudOut():
                 with self._changed:
                     self._clouds.append(output)
@@ -257,6 +278,7 @@ class MapMakers:
             sweeps, self._sweeps = self._sweeps, deque()
             grids, self._grids = self._grids, deque()
             clouds, self._clouds = self._clouds, deque()
+            looks, self._looks = self._looks, deque()
             asked, self._asked = self._asked, deque()
             redrawn, self._redrawn = self._redrawn, None
         for work, done, result in asked:
@@ -280,6 +302,10 @@ class MapMakers:
                 for cloud in clouds:
                     desk.is_fed = True
                     self._guard(desk, partial(desk.maker.take_cloud, cloud))
+            if isinstance(desk.maker, MadeOfLooks):
+                for look in looks:
+                    desk.is_fed = True
+                    self._guard(desk, partial(desk.maker.take_look, look))
             if now_ns >= desk.due_ns and (desk.is_fed or desk.changed):
                 self._make(desk, now_ns)
 

@@ -158,8 +158,25 @@ class CloudOut:
     sensor_m: tuple[float, float, float]
 
 
+@dataclass(frozen=True, slots=True)
+class LookOut:
+    """One look of a ring, for the makers of maps; not published.
+
+    light, touch: (24,) in [0, 1].  way_m: ahead and left in the body's frame, since the first look; only differences
+    mean anything, and none to the look before unless continuous.
+    """
+
+    sensor: str
+    stamp_ns: int
+    light: F64
+    touch: F64
+    way_m: tuple[float, float]
+    continuous: bool
+
+
 Output = (
     CloudOut
+    | LookOut
     | ScanOut
     | RangesOut
     | PolarOut

@@ -28,6 +28,7 @@ from service.outputs import (
     GridOut,
     GridUpdateOut,
     HealthOut,
+    LookOut,
     OdomOut,
     Output,
     PolarOut,
@@ -121,6 +122,8 @@ class Encoder:
     def encode(self, output: Output, wall_offset_ns: int) -> list[Message]:
         """The messages of one output. wall_offset_ns: wall clock minus monotonic clock."""
         match output:
+            case LookOut():
+                return []
             case CloudOut():
                 return [self._cloud(output, wall_offset_ns)]
             case ScanOut():

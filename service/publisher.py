@@ -24,6 +24,7 @@ from service.outputs import (
     GridOut,
     GridUpdateOut,
     HealthOut,
+    LookOut,
     OdomOut,
     Output,
     PolarOut,
@@ -177,6 +178,8 @@ class Publisher:
                 self._outboxes[Lane.MAP].put(slot, parcel)
             case DocumentOut():
                 self._outboxes[topics.topic_of(output.key).lane].put(slot, parcel)
+            case LookOut():
+                pass  # for the makers of maps only
             case GridUpdateOut():
                 self._outboxes[Lane.MAP].put(slot, parcel, depth=_UPDATES_WAITING_MAX)
             case _:
@@ -320,6 +323,8 @@ def slot_of(output: Output) -> str:
     match output:
         case ScanOut():
             return f"scan/{output.sensor}"
+        case LookOut():
+            return f"look/{output.sensor}"
         case CloudOut():
             return f"cloud/{output.mount}"
         case PolarOut():

@@ -101,4 +101,13 @@ class PoseSource:
     kind = "poses"
 
 
-Sensor = Laser | Chain | Wheels | AxleEncoder | Contacts | PoseSource
+@dataclass(frozen=True, slots=True)
+class Ring:
+    """Light and touch all around, with the robot's own way."""
+
+    name: str
+
+    kind = "ring"
+
+
+Sensor = Laser | Chain | Wheels | AxleEncoder | Contacts | PoseSource | Ring

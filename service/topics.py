@@ -265,7 +265,7 @@ MAP_TOPO = Topic(
     "umfeld.topo.v1",
     JSON_TOPO,
     "at most every 5 s, on change",
-    "Convex free regions of the grid and the passages between them, as a graph; if configured.",
+    "Regions of free space and the passages between them, or places and the ways driven; if configured.",
     Priority.DATA_LOW,
     cached=True,
     lane=Lane.MAP,

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sim_devices.alice import Alice
 from sim_devices.attach import Attachment, MemoryLink, PtyLink, TcpLink
 from sim_devices.contact import Bumper, Cliff, Contact
 from sim_devices.device import ByteDevice, CanDevice, Mount, Scene
@@ -111,6 +112,8 @@ def emulate(
         builder.add_wheels(name, wheels)
     for name, mount in robot.config.get("mounts", {}).items():
         builder.add_mount(name, mount)
+    for name, ring in robot.config.get("rings", {}).items():
+        builder.add_ring(name, ring, seed=seed)
     for port in builder.bridge_ports():
         builder.add_bridge(port)
     ports = builder.autopilot_ports()
@@ -348,6 +351,11 @@ class _Builder:
             self._join(bus, f"{target}.{side}", node)
             if isinstance(node, Cia406Encoder):
                 self.robot.encoders[f"{name}.{side}"] = node
+
+    def add_ring(self, name: str, ring: Table, *, seed: int) -> None:
+        """ALICE, in a room of its own: it drives by itself, whatever the world."""
+        _required(ring, f"rings.{name}", ("alice",))
+        self._attach_serial(f"rings.{name}", f"rings-{name}", [ring], "ring", Alice(seed=seed))
 
     def _wheels_target(self, name: str) -> str:
         return "encoder" if len(self.robot.config["wheels"]) == 1 else f"encoder.{name}"
@@ -640,6 +648,16 @@ def _small(name: str, laser: Table, wheels: Table, *, ticks_per_turn: float) -> 
     }
 
 
+def alice() -> Table:
+    """ALICE: light and touch around a synchro drive; no range sensor, so no grid."""
+    corners = [(0.15 * math.cos(a), 0.15 * math.sin(a)) for a in (k * math.pi / 6.0 for k in range(12))]
+    return {
+        "robot": {"id": "alice", "footprint_m": [[round(x, 3), round(y, 3)] for x, y in corners]},
+        "rings": {"body": {"driver": "alice", "port": "/dev/ttyUSB0"}},
+        "grid": {"enabled": False},
+    }
+
+
 def hurry(config: Table, speed: float) -> None:
     """Let the daemon believe wheels that turn so many times faster than in real time."""
     config.setdefault("drive", {})["max_wheel_speed_m_s"] = 5.0 * speed
@@ -657,6 +675,7 @@ PRESETS: dict[str, Callable[[], Table]] = {
     "roboclaw": roboclaw,
     "odrive": odrive,
     "autopilot": autopilot,
+    "alice": alice,
 }
 
 

@@ -18,13 +18,15 @@ Angles: sensor k looks k * 15 degrees counter-clockwise of the body's front.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.frames import Pose2, wrap_angle, wrap_angles
-from mapping.topology.neural_gas import Change, GasRules, NeuralGas
+from mapping.topology.neural_gas import Change, GasRules, GasState, NeuralGas
 
 F64 = NDArray[np.float64]
 
@@ -33,6 +35,7 @@ SENSOR_RAD = 2.0 * math.pi / RING
 _NEAR_SQUARES = 3.0  # how far away, in squares, references are used
 _FLATTER = 0.3  # keeps the slope of their plane low where they do not lie around
 _PULL_LOOKS = 4
+_ARRAYS = 10  # of AliceMap.arrays
 _FINE = 8  # steps a sensor in which correlation is looked at before the parabola
 
 
@@ -210,6 +213,62 @@ class AliceMap:
         nodes = (TopoNode(n, self.position_m(n), self._looks[n], vectors[n].copy()) for n in numbers)
         return TopoGraph(tuple(nodes), edges)
 
+    def arrays(self) -> list[NDArray[Any]]:
+        """All that the map is, for from_arrays."""
+        count = len(self._looks)
+        gas = self._gas.state()
+        edges = [(a, b, e.strength, e.up, e.down) for (a, b), e in sorted(self.edges.items())]
+        places, rings = self._references.arrays()
+        pose = (self.pose.x_m, self.pose.y_m, self.pose.yaw_rad, self.drift_rad_per_m)
+        last = [-1 if number is None else number for number in (self._before_last, self._last)]
+        return [
+            gas.vectors,
+            gas.counts,
+            self._places[:count].copy(),
+            np.array(self._looks, dtype=np.int64),
+            np.array(self._scatter, dtype=np.float64),
+            np.array(edges, dtype=np.float64).reshape(-1, 5),
+            places,
+            rings,
+            np.array(pose),
+            np.array([gas.total, self.dropped, *last], dtype=np.int64),
+        ]
+
+    @classmethod
+    def from_arrays(cls, arrays: Sequence[NDArray[Any]], rules: AliceRules | None = None) -> AliceMap:
+        """The map that arrays() told. ValueError if they are damaged or do not fit together."""
+        if len(arrays) != _ARRAYS:
+            raise ValueError(f"a map of ALICE is {_ARRAYS} arrays, got {len(arrays)}")
+        vectors, counts, places, looks, scatter, edges, reference_places, rings, pose, numbers = arrays
+        count = len(counts)
+        shapes = [array.shape for array in arrays]
+        wanted = [(count, 2 * RING), (count,), (count, 2), (count,), (count,), (len(edges), 5)]
+        wanted += [(len(rings), 2), (len(rings), RING), (4,), (4,)]
+        if shapes != wanted or not all(np.all(np.isfinite(array)) for array in arrays):
+            raise ValueError(f"arrays of a map of ALICE do not fit together: {shapes}")
+        topo = cls(rules)
+        total, topo.dropped, before_last, last = (int(number) for number in numbers)
+        topo._gas = NeuralGas.from_state(GasState(vectors, counts, total), topo.rules.gas)
+        topo._places = np.concatenate((places, np.zeros((max(64, count), 2))))
+        topo._looks = [int(number) for number in looks]
+        topo._scatter = [float(value) for value in scatter]
+        topo._neighbours = {number: set() for number in range(count)}
+        for a, b, strength, up, down in edges:
+            pair = (int(a), int(b))
+            if not 0 <= pair[0] < pair[1] < count:
+                raise ValueError(f"an edge of a map of ALICE joins {pair} of {count} units")
+            topo.edges[pair] = Edge(float(strength), int(up), int(down))
+            topo._neighbours[pair[0]].add(pair[1])
+            topo._neighbours[pair[1]].add(pair[0])
+        if max(before_last, last) >= count:
+            raise ValueError(f"a map of ALICE ends at unit {max(before_last, last)} of {count}")
+        topo._before_last, topo._last = (None if number < 0 else number for number in (before_last, last))
+        for place, ring in zip(reference_places, rings):
+            topo._references.keep((float(place[0]), float(place[1])), ring)
+        topo.pose = Pose2(float(pose[0]), float(pose[1]), float(pose[2]))
+        topo.drift_rad_per_m = float(pose[3])
+        return topo
+
     def _move(self, way_m: tuple[float, float]) -> None:
         """Half the drift before, half after the way: the body turns while it drives."""
         drift = self.drift_rad_per_m * math.hypot(*way_m)
@@ -297,6 +356,11 @@ class _References:
         self._squares: dict[tuple[int, int], int] = {}
         self._places: F64 = np.zeros((64, 2))
         self._rings: F64 = np.zeros((64, RING))
+
+    def arrays(self) -> tuple[F64, F64]:
+        """(N, 2) places and (N, 24) rings, in the order of keeping."""
+        count = len(self._squares)
+        return self._places[:count].copy(), self._rings[:count].copy()
 
     def keep(self, here: tuple[float, float], ring: F64) -> None:
         """Remember the ring, turned to heading 0, if this square has none."""
