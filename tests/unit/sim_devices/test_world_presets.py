@@ -68,6 +68,8 @@ def test_the_daemon_accepts_what_a_preset_prints(name: str, tmp_path: Path) -> N
         for bus in loaded.can.values():
             assert bus.interface == "slcan"
             assert Path(bus.channel).is_symlink()
+        for ring in loaded.rings.values():
+            assert Path(ring.port).is_symlink()
         for wheels in loaded.wheels.values():
             assert wheels.serial_port() is None or Path(wheels.serial_port() or "").is_symlink()
         polar, rect, transducers = {
@@ -75,6 +77,7 @@ def test_the_daemon_accepts_what_a_preset_prints(name: str, tmp_path: Path) -> N
             "nodding": (3, 1, 16),
             "two_wheeler": (1, 1, 2),
             "autopilot": (1, 1, 2),
+            "alice": (0, 0, 0),
         }.get(name, (1, 1, 0))
         assert (len(loaded.sectors.polar), len(loaded.sectors.rect)) == (polar, rect)
         assert sum(len(s.transducers) for s in loaded.sonars.values()) == transducers
