@@ -33,10 +33,7 @@ FLAT_BELOW = 256  # nodes; fewer are read faster than bounded
 MOST_DIRECTIONS = 100  # dimensions; for more, rounding is not proven to stay below kernels.GUARD
 MOST_INTERVAL_BITS = 5
 _WATCHED = 64  # queries between two decisions
-_MANY_IN_QUESTION, _FEW_IN_QUESTION = (
-    1 / 40,
-    1 / 400,
-)  # a group of directions for all costs as much as the rest for 1/40
+_MANY_IN_QUESTION = 1 / 150  # of the nodes: one group of directions more for all then costs as much
 _MARKS_WORTH = 128  # marks pay while candidates are fewer than one in so many nodes
 _GUARD = 1e-9  # for the rounding of 64-bit numbers
 
@@ -269,17 +266,14 @@ class _Bounds:
         return int(number), float(least), int(in_question), int(read)
 
     def _look_back(self, count: int) -> None:
-        """One group more for all nodes if too many were in question after the lead, one less if hardly any."""
-        in_question = self._in_question_sum / self._asked / count
-        if in_question > _MANY_IN_QUESTION:
+        """One group more for all nodes if too many were in question; fewer are tried again when the nodes double."""
+        if self._in_question_sum > _MANY_IN_QUESTION * self._asked * count:
             self.lead = min(self.lead + 1, len(self._steps))
-        elif in_question < _FEW_IN_QUESTION:
-            self.lead = max(self.lead - 1, 1)
         self._asked = self._in_question_sum = 0
 
     def _build(self, nodes: F64, count: int) -> None:
         self._built_at = count
-        self.lead = max(self.lead, 1)
+        self.lead = max(self.lead - 1, 1)
         present = nodes[:count]
         self._centre = present.mean(axis=0)
         away = present - self._centre

@@ -203,8 +203,8 @@ def test_wheels_and_sonars_on_one_port_are_one_board(tmp_path: Path) -> None:
         attachment.stop()
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS))
-def test_every_preset_can_play_a_log(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", sorted(set(PRESETS) - {"alice"}))
+def test_every_preset_with_a_laser_can_play_a_log(name: str, tmp_path: Path) -> None:
     table = for_log(preset(name), Mount(0.1), track_width_m=0.4, rate_hz=100.0, wheel_m_s=10.0)
     table["lasers"]["front"]["port"] = "/dev/null"
     path = tmp_path / "umfeld.toml"
