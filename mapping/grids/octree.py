@@ -34,7 +34,8 @@ STEP: Final = 0.05  # log-odds of one step of a voxel
 HALF: Final = kernels.SIDE // 2  # voxels from the origin to the side of the cube: 1.6 km at 5 cm
 MAX_BOX_VOXELS: Final = 1 << 28
 
-# Bytes: magic, version, resolution, bytes of the tree, bricks, CRC-32 of both; then zlib of the tree and the bricks.
+# Bytes: magic, version, resolution, bytes of the tree, bricks, CRC-32 of all that and of both; then zlib of the
+# tree and the bricks.
 HEADER: Final = struct.Struct("<4sBdIII")
 MAGIC: Final = b"UOCT"
 VERSION: Final = 1
@@ -384,15 +385,17 @@ class Octree:
         body = np.zeros((bricks, kernels.BRICK_VOXELS), dtype=np.int8)
         size, count = kernels.write_tree(self._nodes, self._bricks, tree, body)
         plain = tree[:size].tobytes() + body[:count].tobytes()
-        head = HEADER.pack(MAGIC, VERSION, self.resolution_m, size, count, zlib.crc32(plain))
-        return head + zlib.compress(plain, 6)
+        fields = (MAGIC, VERSION, self.resolution_m, size, count)
+        crc = zlib.crc32(plain, zlib.crc32(HEADER.pack(*fields, 0)))
+        return HEADER.pack(*fields, crc) + zlib.compress(plain, 6)
 
     @classmethod
     def from_bytes(cls, data: bytes, *, rules: VoxelRules | None = None, max_bricks: int = 1 << 17) -> Octree:
         """The octree that to_bytes wrote; ValueError if it is damaged, of another version or larger than max_bricks."""
         if len(data) < HEADER.size:
             raise ValueError("a stored octree is shorter than its header")
-        magic, version, resolution_m, size, count, crc = HEADER.unpack_from(data)
+        *fields, crc = HEADER.unpack_from(data)
+        magic, version, resolution_m, size, count = fields
         if magic != MAGIC:
             raise ValueError("this is no stored octree")
         if version != VERSION:
@@ -404,7 +407,7 @@ class Octree:
             plain = zlib.decompressobj().decompress(data[HEADER.size :], length + 1)
         except zlib.error as error:
             raise ValueError(f"a stored octree is torn: {error}") from error
-        if len(plain) != length or zlib.crc32(plain) != crc:
+        if len(plain) != length or zlib.crc32(plain, zlib.crc32(HEADER.pack(*fields, 0))) != crc:
             raise ValueError("a stored octree is torn: its checksum does not fit")
         octree = cls(resolution_m=resolution_m, rules=rules, max_bricks=max_bricks)
         octree._begin(max(1, count), size // 2 + 8 * kernels.LEVELS + 8)

@@ -377,8 +377,9 @@ def repacked(data: bytes, *, size: int | None = None, body: bytes | None = None)
     """Other contents under a right checksum."""
     magic, version, resolution, tree, count, _ = HEADER.unpack_from(data)
     plain = zlib.decompress(data[HEADER.size :]) if body is None else body
-    tree = tree if size is None else size
-    return HEADER.pack(magic, version, resolution, tree, count, zlib.crc32(plain)) + zlib.compress(plain)
+    fields = (magic, version, resolution, tree if size is None else size, count)
+    crc = zlib.crc32(plain, zlib.crc32(HEADER.pack(*fields, 0)))
+    return HEADER.pack(*fields, crc) + zlib.compress(plain)
 
 
 @settings(max_examples=60, deadline=None)
