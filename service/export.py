@@ -234,6 +234,31 @@ def load_pgm_yaml(yaml_path: Path) -> MapImage:
     return MapImage(cells, resolution_m, Pose2(x, y, yaw))
 
 
+def load_map(path: Path, *, resolution_m: float | None = None) -> MapImage:
+    """A grid map from a sidecar (.yaml), or from a picture: by the sidecar beside it, or with resolution_m at (0, 0).
+
+    A picture without sidecar is read as the map server does with the usual thresholds. MapFileTrouble tells what fails.
+    """
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return load_pgm_yaml(path)
+    sidecar = path.with_suffix(".yaml")
+    if resolution_m is None and sidecar.exists():
+        return load_pgm_yaml(sidecar)
+    if resolution_m is None or not (math.isfinite(resolution_m) and 1e-4 <= resolution_m <= 100.0):
+        raise MapFileTrouble(f"{path}: has no {sidecar.name} beside it; say metres a pixel with --resolution-m 0.05")
+    pixels, opaque = _read_pixels(path)
+    cells = interpret_pixels(
+        pixels,
+        opaque,
+        mode="trinary",
+        negate=False,
+        occupied_threshold=OCCUPIED_THRESHOLD,
+        free_threshold=FREE_THRESHOLD,
+        where=str(path),
+    )
+    return MapImage(cells, resolution_m, IDENTITY)
+
+
 def interpret_pixels(
     pixels: F64,
     opaque: NDArray[np.bool_],

@@ -145,6 +145,109 @@ def regions(
     _tell(found.report, [write_regions(found, path) for path in (out, _as_png(png)) if path is not None], as_json)
 
 
+@app.command()
+def quadtree(
+    file: Annotated[Path, typer.Argument(help="A grid map: .yaml with its picture, or a .pgm or .png.")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=".uqdt, the tree as bytes.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw its squares, too.")] = None,
+    resolution_m: Annotated[float | None, typer.Option(help="Metres a pixel, of a picture without .yaml.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON.")] = False,
+) -> None:
+    """A grid map as a quadtree: how many squares of one kind it takes.
+
+    Example: umfeld extract quadtree map.yaml --out map.uqdt --png squares.png
+    """
+    from service.space_files import quadtree_of_file, write_extracted
+
+    found = quadtree_of_file(file, resolution_m=resolution_m)
+    _tell(found.report, [write_extracted(found, path) for path in (out, _as_png(png)) if path is not None], as_json)
+
+
+@app.command()
+def octree(
+    file: Annotated[Path, typer.Argument(help="A point cloud (.pcd .ply .xyz .3d) or a depth image (.png).")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=".uoct, the tree as bytes.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw the layer at --height-m, too.")] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="Calibration of a depth image; default: the one beside it.")
+    ] = None,
+    resolution_m: Annotated[float, typer.Option(min=0.001, help="Edge of a voxel.")] = 0.05,
+    sensor: Annotated[tuple[float, float, float], typer.Option(help="Where the sensor was: x y z in metres.")] = (
+        0.0,
+        0.0,
+        0.0,
+    ),
+    range_max_m: Annotated[float | None, typer.Option(min=0.01, help="Farther points are no echo.")] = None,
+    height_m: Annotated[float | None, typer.Option(help="Of the layer to draw; default: the sensor's.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON.")] = False,
+) -> None:
+    """Voxels that a point cloud shows free and occupied, as an octree.
+
+    Example: umfeld extract octree room.pcd --out room.uoct --png layer.png
+    """
+    import math
+
+    from service.errors import WrongUsage
+    from service.space_files import octree_of_file, write_extracted
+
+    try:
+        found = octree_of_file(
+            file,
+            camera=camera,
+            resolution_m=resolution_m,
+            sensor_m=sensor,
+            range_max_m=math.inf if range_max_m is None else range_max_m,
+            height_m=height_m,
+        )
+    except ValueError as error:
+        raise WrongUsage(str(error)) from error
+    _tell(found.report, [write_extracted(found, path) for path in (out, _as_png(png)) if path is not None], as_json)
+
+
+@app.command()
+def elevation(
+    file: Annotated[Path, typer.Argument(help="A point cloud (.pcd .ply .xyz .3d) or a depth image (.png), z up.")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=".json, every layer by rows.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw heights and ground, too.")] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="Calibration of a depth image; default: the one beside it.")
+    ] = None,
+    resolution_m: Annotated[float, typer.Option(min=0.001, help="Edge of a cell.")] = 0.1,
+    slope_max_deg: Annotated[float, typer.Option(help="Steeper is not traversable.")] = 20.0,
+    step_max_m: Annotated[float, typer.Option(help="Higher is not traversable.")] = 0.08,
+    roughness_max_m: Annotated[float, typer.Option(help="Rougher (rms) is not traversable.")] = 0.03,
+    height_max_m: Annotated[float | None, typer.Option(help="Leave out points above: ceilings.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON.")] = False,
+) -> None:
+    """Heights of a point cloud by cell: slope, step, roughness, and where a vehicle can drive.
+
+    Example: umfeld extract elevation room.pcd --height-max-m 0.5 --out ground.json --png ground.png
+    """
+    import math
+
+    from mapping.grids.height import GroundRules
+    from service.errors import WrongUsage
+    from service.space_files import elevation_of_file, write_extracted
+
+    try:
+        rules = GroundRules(
+            slope_max_rad=math.radians(slope_max_deg), step_max_m=step_max_m, roughness_max_m=roughness_max_m
+        )
+    except ValueError as error:
+        raise WrongUsage(str(error)) from error
+    found = elevation_of_file(
+        file,
+        camera=camera,
+        resolution_m=resolution_m,
+        rules=rules,
+        height_max_m=math.inf if height_max_m is None else height_max_m,
+    )
+    _tell(found.report, [write_extracted(found, path) for path in (out, _as_png(png)) if path is not None], as_json)
+
+
 def _tell(facts: dict[str, object], written: Sequence[Receipt], as_json: bool) -> None:
     """The report on the screen."""
     if as_json:

@@ -187,7 +187,7 @@ def test_no_driven_way_in_a_sector_meets_what_is_not_traversable(seed: int) -> N
     hole = rng.normal(0.0, 1.0, 2)
     cloud = cloud[np.hypot(*(cloud[:, :2] - hole).T) > 0.3]
     found = elevation_of(cloud)
-    pose = Pose2(*rng.normal(0.0, 0.4, 2), rng.uniform(-3.0, 3.0))
+    pose = Pose2(float(rng.normal(0.0, 0.4)), float(rng.normal(0.0, 0.4)), float(rng.uniform(-3.0, 3.0)))
     bounds = np.sort(rng.uniform(-3.1, 3.1, 4))
     ground = ground_in_sectors(found, pose, bounds, reach_m=2.5)
     for k in range(3):
