@@ -594,6 +594,7 @@ def _mount_settings(config: Config, name: str) -> MountSettings:
         rad_per_tick=2.0 * math.pi / device.counts_per_turn,
         zero_rad=math.radians(device.zero_deg),
         turning=device.motion == "turns",
+        delay_ns=round(device.delay_ms * 1e6),
         wait_ns=config.alignment.odometry_wait_ms * 1_000_000,
     )
 

@@ -485,6 +485,12 @@ class Cia406Mount(Device):
     )
     zero_deg: float = Field(default=0.0, ge=-360, le=360, description="The mount's angle where the count is 0.")
     rate_hz: float = Field(default=100.0, ge=10, le=200, description="Angles a second, by the encoder's own timer.")
+    delay_ms: float = Field(
+        default=0.0,
+        ge=0,
+        le=200,
+        description="From measuring an angle to its arrival; right if floors seen up and down fit.",
+    )
     max_turns_per_s: Positive = Field(
         default=20.0, description="Of the encoder's shaft; bounds how long a gap may hide that the count wrapped."
     )

@@ -33,7 +33,7 @@ _WAITING_MAX = 64
 class MountSettings:
     """name: of the mount, in keys and counters.  laser: the source of its sweeps.  rad_per_tick, zero_rad: angle =
     zero_rad + ticks * rad_per_tick.  turning: it turns on for ever instead of nodding.  wait_ns: longest that a sweep
-    waits.
+    waits.  delay_ns: angles were measured so long before they came.
     """
 
     name: str
@@ -42,6 +42,7 @@ class MountSettings:
     rad_per_tick: float
     zero_rad: float = 0.0
     turning: bool = False
+    delay_ns: int = 0
     wait_ns: int = 500_000_000
 
 
@@ -59,7 +60,8 @@ class TiltingLaser:
         """Where the axle is."""
         if not reading.continuous:
             self._angles.clear()  # from here on it is known again, what lay between is not
-        self._angles.add(reading.stamp_ns, self.settings.zero_rad + reading.ticks * self.settings.rad_per_tick)
+        measured_ns = reading.stamp_ns - self.settings.delay_ns
+        self._angles.add(measured_ns, self.settings.zero_rad + reading.ticks * self.settings.rad_per_tick)
 
     def take_scan(self, scan: Scan, now_ns: int) -> None:
         """A sweep of its laser."""

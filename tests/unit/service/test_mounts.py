@@ -105,6 +105,29 @@ def test_sweeps_of_a_nodding_laser_become_clouds_and_nothing_else(tmp_path: Path
     assert fusion.drops.get("mast", {}) == {}
 
 
+def test_a_delay_that_is_told_is_taken_out_and_all_is_the_same_again(tmp_path: Path) -> None:
+    """Angles that come 20 ms late, told so: the same clouds, bit for bit."""
+    late = config_of(tmp_path, TEXT.replace("zero_deg = 5.0", "zero_deg = 5.0\ndelay_ms = 20.0"))
+    config = config_of(tmp_path)
+    clouds = []
+    for chosen, delay_ns in ((config, 0), (config, 0), (late, 20 * MS)):
+        fusion = fusion_of(chosen)
+        found: list[CloudOut] = []
+        for ms in range(0, 2600, 5):
+            measured_ns = ms * MS
+            ticks = round((math.degrees(angle_at(measured_ns)) - 5.0) * -10.0)
+            fusion.on_item("mast", AngleReading(measured_ns + delay_ns, ticks, ms > 0), measured_ns + delay_ns)
+            if ms % 25 == 0 and ms > 0:
+                fusion.on_item("tilt", sweep_of_floor_and_wall(measured_ns - 20 * MS, config), measured_ns + delay_ns)
+                found += [each for each in fusion.tick(measured_ns + delay_ns) if isinstance(each, CloudOut)]
+        clouds.append(found)
+    first, again, told = clouds
+    assert len(first) == len(again) == len(told) == 2
+    for a, b, c in zip(first, again, told):
+        np.testing.assert_array_equal(a.points_m, b.points_m)
+        np.testing.assert_array_equal(a.points_m, c.points_m)
+
+
 def test_without_angles_nothing_is_placed_and_all_is_counted(tmp_path: Path) -> None:
     config = config_of(tmp_path)
     fusion = fusion_of(config)
