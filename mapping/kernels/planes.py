@@ -511,33 +511,56 @@ def pairs_of_cells(
     Each pair is told once: by the smaller cell, of equal ones by the first.
     """
     pairs = 0
+    place = np.empty((3, 3), np.int64)
+    parent, owner = np.empty(27, np.int64), np.empty(27, np.int64)  # larger neighbours are met several times
     for c in range(from_cell, to_cell):
         own = key[begin[c]] >> (3 * (deepest - level[c]))
-        i, j, h = squeeze(own), squeeze(own >> 1), squeeze(own >> 2)
         top = 1 << (BITS - (deepest - level[c]))
+        for axis in range(3):  # the three places along each axis, -1 outside the lattice
+            middle = squeeze(own >> axis)
+            for step in range(3):
+                at = middle + step - 1
+                place[axis, step] = spread(at) << axis if 0 <= at < top else -1
         before = pairs
+        parents = 0
         for step in range(27):
-            a, b, d = i + step // 9 - 1, j + step // 3 % 3 - 1, h + step % 3 - 1
-            if step == 13 or a < 0 or b < 0 or d < 0 or a >= top or b >= top or d >= top:
+            a, b, d = place[0, step // 9], place[1, step // 3 % 3], place[2, step % 3]
+            if step == 13 or a < 0 or b < 0 or d < 0:
                 continue
-            there = spread(a) | (spread(b) << 1) | (spread(d) << 2)
-            depth = level[c]
-            other = -1
-            while depth >= 0 and other < 0:
-                other = get(mark, index, (1 << (3 * (BITS - deepest + depth))) | there)
-                there >>= 3
-                depth -= 1
+            there = a | b | d
+            other = get(mark, index, (1 << (3 * (BITS - deepest + level[c]))) | there)
+            there >>= 3
+            if other < 0 and there != own >> 3:  # no cell that is as large; what holds c was cut, and is none itself
+                k = 0
+                while k < parents and parent[k] != there:
+                    k += 1
+                if k == parents:
+                    parent[k], owner[k] = there, larger_cell(mark, index, there, level[c] - 1, deepest)
+                    parents += 1
+                other = owner[k]
             if other < 0 or other == c or (level[other] == level[c] and other < c):
                 continue
             new = True
-            for k in range(before, pairs):
-                if pair[k, 1] == other:
-                    new = False
-                    break
+            if level[other] < level[c]:
+                for k in range(before, pairs):
+                    if pair[k, 1] == other:
+                        new = False
+                        break
             if new:
                 pair[pairs, 0], pair[pairs, 1] = c, other
                 pairs += 1
     return pairs
+
+
+@njit(cache=True, nogil=True)
+def larger_cell(mark: Any, index: Any, there: int, depth: int, deepest: int) -> Any:
+    """The cell of this depth or less in which a place lies, -1 if none does."""
+    other = -1
+    while depth >= 0 and other < 0:
+        other = get(mark, index, (1 << (3 * (BITS - deepest + depth))) | there)
+        there >>= 3
+        depth -= 1
+    return other
 
 
 @njit(cache=True, nogil=True)

@@ -36,8 +36,8 @@ I64 = NDArray[np.int64]
 
 FARTHEST_M: Final = 1e4  # a point beyond is no measurement
 _ROUNDS: Final = 2  # of giving points to planes and fitting these
-_CHUNKS: Final = 8  # of cells, for several threads; their number changes nothing
-_NOISE_SAMPLES: Final = 800
+_CHUNKS: Final = 2  # of the work, for two cores; their number changes nothing
+_NOISE_SAMPLES: Final = 500
 _NOISE_CELL: Final = 16.0  # a cell is so many times as large as the noise, or its scatter says more of its size
 _NOISE_MOST: Final = 32  # points of a cell from which noise is taken
 _NOISE_LEAST: Final = 9
@@ -292,7 +292,7 @@ class _Extraction:
                 self.x, self.y, self.z, self.key, self.deepest, smallest, _NOISE_MOST, _NOISE_LEAST, _NOISE_SAMPLES,
                 range_m, sigma,
             )  # fmt: skip
-            if found and np.quantile(sigma[:found], _NOISE_SHARE) * _NOISE_CELL <= size:
+            if found and _usual(sigma[:found]) * _NOISE_CELL <= size:
                 break
             size *= 2.0
         noise = noise_of_scatter(range_m[:found], sigma[:found], most_m=self.rules.inlier_m / 2.0)
@@ -412,12 +412,26 @@ class _Extraction:
     def _polygons(self, label: I64, normal: F64, centre: F64) -> list[F64]:
         along, across = axes_of(normal)
         first, member = kernels.groups_of(label, len(normal))
-        corner = np.empty((len(member) + 2 * len(normal) + 2, 2))
-        begins = kernels.hulls(self.x, self.y, self.z, first, member, centre, along, across, corner)
-        return [
-            centre[r] + corner[a:b, :1] * along[r] + corner[a:b, 1:] * across[r]
-            for r, (a, b) in enumerate(pairwise(begins))
-        ]
+        share = np.linspace(0, len(member), _CHUNKS + 1)
+        cut = np.unique(np.concatenate((np.searchsorted(first, share[:-1]), [len(normal)])))
+
+        def work(part: int) -> list[F64]:
+            a, b = int(cut[part]), int(cut[part + 1])
+            corner = np.empty((int(first[b] - first[a]) + 2 * (b - a) + 2, 2))
+            begins = kernels.hulls(
+                self.x, self.y, self.z, first[a : b + 1], member, centre[a:b], along[a:b], across[a:b], corner
+            )
+            return [
+                centre[r] + corner[i:j, :1] * along[r] + corner[i:j, 1:] * across[r]
+                for r, (i, j) in enumerate(pairwise(begins), a)
+            ]
+
+        return [outline for outlines in self.run(work, range(len(cut) - 1)) for outline in outlines]
+
+
+def _usual(sigma: F64) -> float:
+    """What so large a share of cells does not exceed."""
+    return float(np.sort(sigma)[int(_NOISE_SHARE * (len(sigma) - 1))])
 
 
 def noise_of_scatter(range_m: F64, sigma: F64, *, most_m: float) -> RangeNoise:
@@ -427,8 +441,8 @@ def noise_of_scatter(range_m: F64, sigma: F64, *, most_m: float) -> RangeNoise:
         return RangeNoise(min(max(floor, float(np.median(sigma))) if len(sigma) else most_m, most_m))
     order = np.argsort(range_m, kind="stable")
     groups = [g for g in np.array_split(order, min(8, len(order) // 8)) if len(g)]
-    typical = np.array([np.quantile(sigma[g], _NOISE_SHARE) for g in groups])
-    far2 = np.array([np.median(range_m[g]) for g in groups]) ** 2
+    typical = np.array([_usual(sigma[g]) for g in groups])
+    far2 = np.array([range_m[g[len(g) // 2]] for g in groups]) ** 2
     slope = 0.0
     if len(groups) > 2:
         pairs = [

@@ -131,8 +131,9 @@ def test_a_sensor_elsewhere_moves_the_ranges_not_the_planes() -> None:
     points, _ = room()
     here, there = extract_planes(points), extract_planes(points + (10.0, -4.0, 2.0), sensor_m=(10.0, -4.0, 2.0))
     assert len(there) == len(here)
-    np.testing.assert_allclose(there.centre_m - (10.0, -4.0, 2.0), here.centre_m, atol=1e-9)
-    np.testing.assert_allclose(np.abs(np.sum(there.normal * here.normal, axis=1)), 1.0, atol=1e-9)
+    # Coordinates are rounded elsewhere, and a point at a border may fall into the other cell.
+    np.testing.assert_allclose(there.centre_m - (10.0, -4.0, 2.0), here.centre_m, atol=0.01)
+    np.testing.assert_allclose(np.abs(np.sum(there.normal * here.normal, axis=1)), 1.0, atol=1e-5)
     np.testing.assert_allclose(np.sum(there.normal * there.centre_m, axis=1), there.distance_m, atol=1e-9)
 
 
