@@ -87,9 +87,10 @@ if TYPE_CHECKING:
     from service.background import Submit
     from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
     from service.map_localiser import KnownMapLayer
-    from service.map_makers import MapMaker
+    from service.map_makers import MapMaker, MapMakers
     from service.mavlink_out import MavlinkOut
     from service.redraw import OnRedrawn
+    from service.rpc import Handler
 
 
 @dataclass(frozen=True, slots=True)
@@ -558,6 +559,12 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         topo = config.topo
         period_ns = round(topo.period_s * 1e9)
         makers.append(TopoMaker(period_ns=period_ns, smooth_m=topo.smooth_m, door_m=topo.door_m))
+    if config.scenes.enabled and (fed_by := lasers & _sources(config, config.scenes.sources, found)):
+        from service.scene_maker import SceneMaker
+
+        seen_by = [each for each in found.values() if isinstance(each, Laser) and each.name in fed_by]
+        mounts = {each.name: each.base_from_sensor for each in seen_by}
+        makers.append(SceneMaker(mounts, most=config.scenes.most, period_ns=round(config.scenes.period_s * 1e9)))
     return makers
 
 
@@ -597,6 +604,20 @@ def _mount_settings(config: Config, name: str) -> MountSettings:
         delay_ns=round(device.delay_ms * 1e6),
         wait_ns=config.alignment.odometry_wait_ms * 1_000_000,
     )
+
+
+def maker_calls(makers: Sequence[MapMaker], slow: MapMakers) -> Iterator[tuple[str, Handler]]:
+    """Calls into the maps of the slow thread, by name; they run there."""
+    for maker in makers:
+        if maker.name == "scenes":
+            from service.scene_maker import SceneMaker
+
+            assert isinstance(maker, SceneMaker)
+            yield "where_am_i", partial(_ask, slow, maker.where_am_i)
+
+
+def _ask(slow: MapMakers, answer: Handler, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    return slow.ask(partial(answer, arguments))
 
 
 def _artos_map(config: Config, polar: Sequence[PolarLayer]) -> ArtosLayer:
@@ -782,7 +803,8 @@ def _mavlink_sources(config: Config) -> list[tuple[str, str]]:
 def warm_up(config: Config) -> None:
     """Load or compile every kernel this configuration uses, on maps that are thrown away."""
     found = sensors(config)
-    if map_makers(config, found) and config.lines.enabled:
+    names = {maker.name for maker in map_makers(config, found)}
+    if "lines" in names:
         from mapping.lines.warm_up import warm_up as warm_up_lines
 
         warm_up_lines()
@@ -794,6 +816,10 @@ def warm_up(config: Config) -> None:
         from mapping.planes.warm_up import warm_up as warm_up_planes
 
         warm_up_planes()
+    if "scenes" in names:
+        from mapping.features.warm_up import warm_up as warm_up_features
+
+        warm_up_features()
     if config.localise.mode == "map":
         from mapping.localise.warm_up import warm_up_in_map
 

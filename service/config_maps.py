@@ -127,6 +127,15 @@ class TopoMapSettings(Section):
     door_m: float = Field(default=1.3, ge=0.1, le=10.0, description="Wider passages join regions to one room.")
 
 
+class SceneMapSettings(Section):
+    """Scenes to be recognised again: key map/scenes, call @rpc/where_am_i."""
+
+    enabled: bool = Field(default=True, description="Collect them.")
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Lasers that see them; default: all.")
+    period_s: float = Field(default=5.0, ge=1.0, le=3600, description="Shortest time between two summaries.")
+    most: int = Field(default=5000, ge=1, le=20000, description="Scenes that are kept; later ones are left out.")
+
+
 class SlamLive(Section):
     """Where the robot is: found by laying laser scans on each other, not by the wheels alone."""
 

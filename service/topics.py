@@ -16,6 +16,7 @@ JSON_HEALTH = "application/json;umfeld.health.v1"
 JSON_INFO = "application/json;umfeld.info.v1"
 JSON_GRID = "application/json;umfeld.grid.v1"
 JSON_LINES = "application/json;umfeld.lines.v1"
+JSON_SCENES = "application/json;umfeld.scenes.v1"
 JSON_GRAPH = "application/json;umfeld.graph.v1"
 JSON_PLANES = "application/json;umfeld.planes.v1"
 JSON_TOPO = "application/json;umfeld.topo.v1"
@@ -231,6 +232,16 @@ MAP_LINES = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+MAP_SCENES = Topic(
+    "map/scenes",
+    "umfeld.scenes.v1",
+    JSON_SCENES,
+    "at most every 5 s, on change",
+    "Scenes that can be recognised again: how many, and the newest.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 MAP_GRAPH = Topic(
     "map/graph",
     "umfeld.graph.v1",
@@ -325,6 +336,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_LOCAL,
     MAP_ARTOS,
     MAP_LINES,
+    MAP_SCENES,
     MAP_GRAPH,
     LOCALISATION,
     MAP_PLANES,

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from mapping.features.anchors import AnchorFinder
-from mapping.features.graph import anchor_graph, compare
-from mapping.features.histograms import square_scene
+from mapping.features.graph import compare
 from mapping.features.range_image import segment_ranges
+from mapping.features.scenes import SceneDatabase, sight_of
+from mapping.frames import Pose2
+from mapping.scan import Scan
 
 
 def warm_up() -> None:
-    """Look at an empty room and recognise it."""
+    """Look at an empty room, remember it, and recognise it."""
     bearing = np.linspace(-np.pi, np.pi, 180, endpoint=False)
-    ranges = 2.0 / np.maximum(np.abs(np.cos(bearing)), np.abs(np.sin(bearing)))
+    ranges = 2.0 / np.maximum(np.abs(np.cos(bearing)), np.abs(np.sin(bearing) / 1.5))
+    sight = sight_of(Scan(0, 0.0, bearing, ranges, 0.0, 10.0))
     segment_ranges(ranges)
-    square_scene(np.stack((ranges * np.cos(bearing), ranges * np.sin(bearing)), axis=-1))
-    graph = anchor_graph(AnchorFinder(bearing).find(ranges))
-    compare(graph, graph)
+    compare(sight.graph, sight.graph)
+    database = SceneDatabase()
+    database.add(sight, Pose2())
+    database.where_am_i(sight)
+    database.add_bytes(database.scene_bytes(0))

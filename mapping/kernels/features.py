@@ -411,3 +411,177 @@ def chords(points: Any, span_m: float, gap_m: float, out: Any) -> Any:
                 count += 1
                 break
     return count
+
+
+# --------------------------------------------------------------------------------- S25 index over distances, proposals
+
+ENTRY_SCENE, ENTRY_FROM, ENTRY_TO = range(3)
+
+
+@njit(cache=True, nogil=True)
+def pair_key(distance: int, alpha: int, beta: int, sides: int, turns: int) -> Any:
+    """Number of a bin of the index: distance bin, directions of a wall at either end against the edge, which walls."""
+    return ((distance * turns + alpha) * turns + beta) * 4 + sides
+
+
+@njit(cache=True, nogil=True)
+def index_entries(
+    anchors: Any, first: Any, scenes: Any, shortest_m: float, longest_m: float, step_m: float, turns: int,
+    keys: Any, entries: Any,
+) -> Any:  # fmt: skip
+    """Every ordered pair of anchors with walls, once for each choice of a wall at either end.
+
+    anchors: (A, ROW) of all scenes, first: (S + 1,) where each begins; scenes: (S,) their numbers.  keys (K,) and
+    entries (K, 3) are filled as far as they reach; returns how many there are.
+    """
+    count = 0
+    for at in range(scenes.size):
+        for i in range(first[at], first[at + 1]):
+            for j in range(first[at], first[at + 1]):
+                if i == j or anchors[i, KIND] == VIRTUAL or anchors[j, KIND] == VIRTUAL:
+                    continue
+                dx, dy = anchors[j, X] - anchors[i, X], anchors[j, Y] - anchors[i, Y]
+                d = math.sqrt(dx * dx + dy * dy)
+                if d < shortest_m or d >= longest_m:
+                    continue
+                bearing = math.atan2(dy, dx)
+                for side_i in range(2):
+                    if not math.isfinite(anchors[i, BEFORE + side_i]):
+                        continue
+                    for side_j in range(2):
+                        if not math.isfinite(anchors[j, BEFORE + side_j]):
+                            continue
+                        if count < keys.size:
+                            alpha = turn_bin(anchors[i, BEFORE + side_i] - bearing, turns)
+                            beta = turn_bin(anchors[j, BEFORE + side_j] - bearing, turns)
+                            keys[count] = pair_key(int(d / step_m), alpha, beta, 2 * side_i + side_j, turns)
+                            entries[count, ENTRY_SCENE] = scenes[at]
+                            entries[count, ENTRY_FROM] = i - first[at]
+                            entries[count, ENTRY_TO] = j - first[at]
+                        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def turn_bin(angle: float, turns: int) -> Any:
+    """Which of `turns` bins of a full turn an angle lies in."""
+    share = angle / (2.0 * math.pi)
+    return int((share - math.floor(share)) * turns) % turns
+
+
+@njit(cache=True, nogil=True)
+def neighbour_bins(value: float, first: Any) -> Any:
+    """The bin of a value in units of bins, and its nearer neighbour: every difference below half a bin is met."""
+    at = math.floor(value)
+    other = at + 1 if value - at >= 0.5 else at - 1
+    return int(at), int(other)
+
+
+@njit(cache=True, nogil=True)
+def slot_of(scene: int, ix: int, iy: int, iyaw: int, table_key: Any) -> Any:
+    """The place of a bin of poses in an open hash table whose size is a power of two; -1 if the table is full."""
+    key = ((np.int64(scene) * 4096 + (ix & 4095)) * 4096 + (iy & 4095)) * 64 + iyaw + 1
+    mask = table_key.size - 1
+    at = (key * np.int64(-7046029254386353131) >> 20) & mask
+    for _ in range(64):
+        if table_key[at] == 0:
+            table_key[at] = key
+            return at
+        if table_key[at] == key:
+            return at
+        at = (at + 1) & mask
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def vote(
+    query: Any, edges: Any, length: Any, anchors: Any, first: Any, starts: Any, entries: Any, step_m: float,
+    turns: int, shortest_m: float, tolerance_m: float, turn_tolerance: float, bin_m: float, bin_rad: float,
+    most_votes: int, table_key: Any, table_scene: Any, table_last: Any, table_sum: Any,
+) -> Any:  # fmt: skip
+    """Poses of the query in the frames of stored scenes, one vote for each edge that both have, largest edges first.
+
+    query (N, ROW), edges (E, 2) by falling length (E,); starts: where each bin's entries begin.  table_*: an empty
+    hash table over (scene, pose bin): the last edge that voted there, from 1 (an edge votes once), sums of x, y, cosine
+    and sine of yaw weighted by length, and of weights.  Returns how many votes there were.
+    """
+    pose = np.empty(3)
+    votes = 0
+    distances = starts.size // (4 * turns * turns)
+    for e in range(edges.shape[0]):
+        d = length[e]
+        if d < shortest_m or votes >= most_votes:
+            break
+        i, j = edges[e, 0], edges[e, 1]
+        bearing = math.atan2(query[j, Y] - query[i, Y], query[j, X] - query[i, X])
+        here_d = neighbour_bins(d / step_m, 0)
+        for side_i in range(2):
+            wall_i = query[i, BEFORE + side_i]
+            if not math.isfinite(wall_i):
+                continue
+            alpha = turn_share(wall_i - bearing) * turns
+            here_a = neighbour_bins(alpha, 0)
+            for side_j in range(2):
+                wall_j = query[j, BEFORE + side_j]
+                if not math.isfinite(wall_j):
+                    continue
+                beta = turn_share(wall_j - bearing) * turns
+                here_b = neighbour_bins(beta, 0)
+                for nd in range(2):
+                    if here_d[nd] < 0 or here_d[nd] >= distances:
+                        continue
+                    for na in range(2):
+                        for nb in range(2):
+                            key = pair_key(
+                                here_d[nd], here_a[na] % turns, here_b[nb] % turns, 2 * side_i + side_j, turns
+                            )
+                            for at in range(starts[key], starts[key + 1]):
+                                scene = entries[at, ENTRY_SCENE]
+                                p = anchors[first[scene] + entries[at, ENTRY_FROM]]
+                                q = anchors[first[scene] + entries[at, ENTRY_TO]]
+                                stored = math.sqrt((q[X] - p[X]) ** 2 + (q[Y] - p[Y]) ** 2)
+                                if abs(stored - d) > tolerance_m:
+                                    continue
+                                pair_pose(query[i], query[j], p, q, pose)
+                                if not (
+                                    are_alike(query[i], p, pose[2], turn_tolerance)
+                                    and are_alike(query[j], q, pose[2], turn_tolerance)
+                                ):
+                                    continue
+                                votes += 1
+                                slot = slot_of(
+                                    scene,
+                                    math.floor(pose[0] / bin_m),
+                                    math.floor(pose[1] / bin_m),
+                                    math.floor((pose[2] + math.pi) / bin_rad) & 63,
+                                    table_key,
+                                )
+                                if slot < 0 or table_last[slot] == e + 1:
+                                    continue
+                                table_last[slot] = e + 1
+                                table_scene[slot] = scene
+                                table_sum[slot, 0] += d * pose[0]
+                                table_sum[slot, 1] += d * pose[1]
+                                table_sum[slot, 2] += d * math.cos(pose[2])
+                                table_sum[slot, 3] += d * math.sin(pose[2])
+                                table_sum[slot, 4] += d
+    return votes
+
+
+@njit(cache=True, nogil=True)
+def turn_share(angle: float) -> Any:
+    """An angle as a share of a full turn, in [0, 1)."""
+    share = angle / (2.0 * math.pi)
+    return share - math.floor(share)
+
+
+@njit(cache=True, nogil=True)
+def settle_proposals(
+    query: Any, anchors: Any, first: Any, scenes: Any, poses: Any, near_m: float, turn_tolerance: float,
+    count: Any, squares: Any,
+) -> None:  # fmt: skip
+    """Correspondences at each proposed pose (P, 3) in the frame of its scene (P,); poses become those they imply."""
+    partner = np.empty(query.shape[0], dtype=np.int64)
+    for k in range(scenes.size):
+        stored = anchors[first[scenes[k]] : first[scenes[k] + 1]]
+        count[k], squares[k] = settle(query, stored, near_m, turn_tolerance, poses[k], partner)

@@ -1,0 +1,205 @@
+"""Where am I, by anchor graphs alone: scenes from the first 60 % of a recorded run, questions from the rest.
+
+    UMFELD_DATA=... python bench/relocalise_features.py [--json FILE]
+
+Truth: the corrected paths of the logs (gfs). A scene and a question every 0.4 m or 20 degrees; each question is one
+single scan, without a hint. Figures, over the questions asked from where the place was seen before (a scene was taken
+within 1 m and 45 degrees; also within 2 m and 60), and over the others:
+right    within 0.5 m and 5 degrees of the truth
+wrong    another place was told
+unknown  no place was told
+Then the time of a question against 1, 4 and 16 times the scenes (the run's, laid out again 1 km apart with other walls:
+mirrored and stretched) and with 1, 4 and 16 times the beams (of a simulated room).
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from drivers.logs import read_log
+from mapping.features.scenes import SceneDatabase, Sight, sight_of
+from mapping.frames import Pose2, wrap_angle
+from mapping.scan import Scan
+
+F64 = NDArray[np.float64]
+Posed = tuple[Scan, Pose2]
+
+LOGS = ("intel", "fr079")
+SHARE = 0.6
+STEP_M, STEP_RAD = 0.4, math.radians(20.0)
+RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
+SEEN = {"seen before, 1 m and 45 deg": (1.0, 45.0), "seen before, 2 m and 60 deg": (2.0, 60.0)}
+
+
+def posed_scans(name: str) -> list[Posed]:
+    """The scans of a log that its corrected path has a pose for."""
+    folder = Path(os.environ["UMFELD_DATA"]) / "carmen_logs"
+    log = read_log(folder / f"{name}.clf.gz")
+    path: dict[str, Pose2] = {}
+    with gzip.open(folder / f"{name}.gfs.txt.gz", "rt") as file:
+        for line in file:
+            words = line.split()
+            if words and not line.startswith("#"):
+                path[words[0]] = Pose2(*(float(word) for word in words[1:4]))
+    return [
+        (Scan(0, 0.0, each.bearing_rad, each.range_m, 0.02, log.range_max_m), path[each.stamp_text])
+        for each in log.scans
+        if each.stamp_text in path
+    ]
+
+
+def spaced(scans: list[Posed]) -> Iterator[Posed]:
+    """Those that are STEP_M or STEP_RAD from the last one."""
+    last: Pose2 | None = None
+    for scan, pose in scans:
+        if last is None or distance(pose, last) >= STEP_M or abs(wrap_angle(pose.yaw_rad - last.yaw_rad)) >= STEP_RAD:
+            last = pose
+            yield scan, pose
+
+
+def distance(a: Pose2, b: Pose2) -> float:
+    return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m)
+
+
+def remembered(scans: list[Posed]) -> SceneDatabase:
+    database = SceneDatabase()
+    for scan, pose in spaced(scans):
+        if not database.covers(pose):
+            database.add(sight_of(scan), pose)
+    return database
+
+
+def outcome(database: SceneDatabase, sight: Sight, truth: Pose2) -> str:
+    place = database.where_am_i(sight).place
+    if place is None:
+        return "unknown"
+    found = place.map_from_sensor
+    is_right = distance(found, truth) < RIGHT_M and abs(wrap_angle(found.yaw_rad - truth.yaw_rad)) < RIGHT_RAD
+    return "right" if is_right else "wrong"
+
+
+def relocalise(name: str) -> dict[str, Any]:
+    scans = posed_scans(name)
+    cut = round(SHARE * len(scans))
+    database = remembered(scans[:cut])
+    tables = {label: {"right": 0, "wrong": 0, "unknown": 0} for label in (*SEEN, "not seen before")}
+    for scan, pose in spaced(scans[cut:]):
+        told = outcome(database, sight_of(scan), pose)
+        place, turn = database.apart(pose)
+        seen = [label for label, (m, deg) in SEEN.items() if np.any((place < m) & (turn < math.radians(deg)))]
+        for label in seen or ["not seen before"]:
+            tables[label][told] += 1
+    return {"scenes": len(database), "anchors": database.anchors, "memory_bytes": database.memory_bytes, **tables}
+
+
+def question_ms(database: SceneDatabase, sights: list[Sight], rounds: int = 3) -> dict[str, float]:
+    """Median and 95th percentile over all questions, each the fastest of some rounds."""
+    database.where_am_i(sights[0])
+    times = []
+    for sight in sights:
+        spent = []
+        for _ in range(rounds):
+            start = time.perf_counter()
+            database.where_am_i(sight)
+            spent.append(time.perf_counter() - start)
+        times.append(1e3 * min(spent))
+    return {"median": round(float(np.median(times)), 2), "p95": round(float(np.percentile(times, 95)), 2)}
+
+
+def other_walls(scan: Scan, number: int) -> Scan:
+    """The scan of another building: stretched differently along both axes, every other one mirrored."""
+    factor = 1.0 + 0.03 * number
+    bearing, distance_m = scan.bearing_rad, scan.range_m
+    c, s = np.cos(bearing), np.sin(bearing) / factor
+    stretched = distance_m / np.hypot(c, s)
+    return replace(scan, range_m=stretched if number % 2 == 0 else stretched[::-1].copy())
+
+
+def growth_with_scenes(name: str) -> dict[str, Any]:
+    scans = posed_scans(name)
+    cut = round(SHARE * len(scans))
+    kept = [(scan, pose) for scan, pose in spaced(scans[:cut])]
+    sights = [sight_of(scan) for scan, _ in list(spaced(scans[cut:]))[:120]]
+    result: dict[str, Any] = {}
+    for times in (1, 4, 16):
+        database = SceneDatabase()
+        for number in range(times):
+            for scan, pose in kept:
+                at = Pose2(pose.x_m + 1000.0 * number, pose.y_m, pose.yaw_rad)
+                database.add(sight_of(scan if number == 0 else other_walls(scan, number)), at)
+        start = time.perf_counter()
+        database.where_am_i(sights[0])
+        first_ms = 1e3 * (time.perf_counter() - start)
+        result[f"{times}x"] = {
+            "scenes": len(database),
+            "index_ms": round(first_ms, 1),
+            "memory_mb": round(database.memory_bytes / 1e6, 1),
+            "question_ms": question_ms(database, sights),
+        }
+    return result
+
+
+def growth_with_beams() -> dict[str, Any]:
+    """A drive through the office of bench/grid_insert.py, 270, 1080 and 4320 beams over 270 degrees."""
+    from bench.grid_insert import cast, drive, office
+
+    walls = office(np.random.default_rng(20))[0]
+    result: dict[str, Any] = {}
+    for beams in (270, 1080, 4320):
+        bearing = np.linspace(-0.75 * math.pi, 0.75 * math.pi, beams)
+        random, database, sights, made = np.random.default_rng(1), SceneDatabase(), [], []
+        for pose, _ in drive("office"):
+            ranges = cast(walls, pose.x_m, pose.y_m, bearing + pose.yaw_rad) + random.normal(0.0, 0.008, beams)
+            scan = Scan(0, 0.0, bearing, ranges, 0.05, 30.0)
+            sight_of(scan)
+            start = time.perf_counter()
+            sights.append(sight_of(scan))
+            made.append(1e3 * (time.perf_counter() - start))
+            database.add(sights[-1], pose)
+        result[f"{beams} beams"] = {
+            "scan_to_sight_ms": round(float(np.median(made)), 2),
+            "question_ms": question_ms(database, sights[:40]),
+        }
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    if "UMFELD_DATA" not in os.environ:
+        parser.error("set UMFELD_DATA to the folder of recorded data")
+    report: dict[str, Any] = {name: relocalise(name) for name in LOGS}
+    for name in LOGS:
+        print(f"{name}: {report[name]['scenes']} scenes, {report[name]['anchors']} anchors")
+        for label in (*SEEN, "not seen before"):
+            table = report[name][label]
+            asked = sum(table.values())
+            shares = ", ".join(f"{key} {n} ({100 * n / max(asked, 1):.1f} %)" for key, n in table.items())
+            print(f"  {label}: {asked} asked; {shares}")
+    report["scenes"] = growth_with_scenes("fr079")
+    report["beams"] = growth_with_beams()
+    for part in ("scenes", "beams"):
+        for label, row in report[part].items():
+            print(f"{part} {label}: {row}")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(report, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
