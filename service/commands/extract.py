@@ -259,6 +259,36 @@ def _tell(facts: dict[str, object], written: Sequence[Receipt], as_json: bool) -
         typer.echo(f"{receipt.path}  {receipt.size} bytes")
 
 
+@app.command()
+def features(
+    file: Annotated[Path, typer.Argument(help="A scan log: CARMEN, robotdata, tinySLAM; plain or .gz.")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=".json; default: to the screen.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw them, too.")] = None,
+    scan: Annotated[int, typer.Option(help="Which scan, from 0; negative from the end.")] = 0,
+) -> None:
+    """What one scan looks like: moments, main orientation, walls, box, anchor points and their graph.
+
+    Example: umfeld extract features intel.clf.gz --scan 2500 --out features.json --png features.png
+    """
+    from service.errors import WrongUsage
+    from service.feature_files import features_of_log, json_bytes, png_bytes
+    from service.files import write_whole
+
+    if out is not None and out.suffix.lower() != ".json":
+        raise WrongUsage(f"--out {out}: features are written as .json")
+    picture = _as_png(png)
+    found = features_of_log(file, scan=scan)
+    written = [] if out is None else [write_whole(out, json_bytes(found.document))]
+    if picture is not None:
+        written.append(write_whole(picture, png_bytes(found)))
+    if out is None:
+        typer.echo(json_bytes(found.document).decode(), nl=False)
+        return
+    for receipt in written:
+        typer.echo(f"{receipt.path}  {receipt.size} bytes")
+
+
 def _as_png(path: Path | None) -> Path | None:
     from service.errors import WrongUsage
 
