@@ -54,7 +54,7 @@ def robot(*sources: str, **sections: Table) -> Table:
 
 
 def with_laser(driver: str, port: str = "/dev/ttyUSB0") -> Table:
-    return robot("front", lasers={"front": {"driver": driver, "port": port}})
+    return robot("front", lasers={"front": {"driver": driver, "port": port, "no_echo": "unknown"}})
 
 
 def with_sonars(driver: str, channels: Sequence[int] = (1, 2, 3), **more: object) -> Table:
@@ -201,7 +201,7 @@ BUS = [
     Trouble(("rename=1",), target="adapter.main"),
     Trouble(("drop=0.3",), "counted", target="adapter.main"),
 ]
-LASER = [Trouble((kind,), "blind") for kind in ("lost_sector", "sun=1", "black")]
+LASER = [Trouble((kind,), "blind") for kind in ("lost_sector", "sun=1", "black", "glass=1")]
 
 SWITCH = [Trouble((kind,), "blocked", target="contact.bumpers.4") for kind in ("stuck_on",)]
 
@@ -344,9 +344,10 @@ class Bench:
             row.stale_ms = (max(fresh, default=begun_ns) + TURN_NS - begun_ns) / 1e6
 
     def _blind_beams(self, since_ns: int) -> int:
-        """The most beams of one scan that could not tell anything."""
+        """The most beams of one scan that told nothing, or that they saw nothing."""
         readings = self.rig.readings(self.device.source, since_ns)
-        return max((int(np.isnan(each.range_m).sum()) for each in readings if isinstance(each, ScanReading)), default=0)
+        scans = (each.range_m for each in readings if isinstance(each, ScanReading))
+        return max((int((np.isnan(each) | np.isposinf(each)).sum()) for each in scans), default=0)
 
     def _has_broken(self, since_ns: int) -> bool:
         """Whether wheels have told that motion was lost: the pose is another one from there on."""

@@ -444,7 +444,16 @@ def _channels(board: UsBoardSonars | UsBoardSerialSonars | MaxBotixSonars) -> li
 def _sensor_of(source: str, device: Device) -> Sensor:
     match device:
         case HokuyoLaser() | SickLms2xxLaser() | RplidarLaser() | LdrobotLaser() | SickColaLaser():
-            return Laser(source, pose_of(device.mount), height_m=device.mount.z_m, upside_down=device.mount.upside_down)
+            said_by_laser = isinstance(
+                device, HokuyoLaser | SickLms2xxLaser
+            )  # of others the driver knows what a 0 means
+            return Laser(
+                source,
+                pose_of(device.mount),
+                height_m=device.mount.z_m,
+                upside_down=device.mount.upside_down,
+                nothing_is_free=not said_by_laser or device.no_echo == "clear",
+            )
         case UsBoardSonars() | UsBoardSerialSonars() | MaxBotixSonars() | ArduinoSonars() | MavlinkSonars():
             transducers = tuple(
                 Transducer(each.channel, Pose2(each.x_m, each.y_m, math.radians(each.yaw_deg)), each.z_m)

@@ -174,6 +174,10 @@ _PORT = (
     "Serial port, best by a stable name (/dev/serial/by-id/...), an address (tcp://192.168.0.10:10940), or the "
     "device's serial number (serial:H0614967, the same as serial = ...)."
 )
+_NOTHING_SEEN = (
+    "What it means when the laser says that it saw nothing. clear: free up to the farthest echo; unknown: nothing, as "
+    "where there is glass, which the beam passes."
+)
 _NO_ECHO = (
     "What a distance of 0 means. unknown: too far, or too near, too dark, glass; clear: nothing up to the farthest "
     "echo, which frees space and is right only where none of these is around."
@@ -189,6 +193,7 @@ class HokuyoLaser(Device):
         default=None, ge=1200, le=4000000, description="Line speed to try first on RS-232; default: all of them."
     )
     intensity: bool = Field(default=False, description="Ask for intensities where the device has them (UTM-30LX).")
+    no_echo: NoEcho = Field(default="clear", description=_NOTHING_SEEN)
     mount: Mount = Field(default=Mount(), description="Where the laser sits.")
     first_step: int | None = Field(default=None, ge=0, description="Narrows the field: first step of the device's own.")
     last_step: int | None = Field(default=None, ge=0, description="Narrows the field: last step.")
@@ -223,6 +228,7 @@ class SickLms2xxLaser(Device):
     unit: Literal["keep", "mm", "cm"] = Field(
         default="keep", description="mm: up to 8 m; cm: up to 80 m; written into the scanner where it is set otherwise."
     )
+    no_echo: NoEcho = Field(default="clear", description=_NOTHING_SEEN)
     mount: Mount = Field(default=Mount(), description="Where the laser sits.")
 
     @model_validator(mode="after")

@@ -475,6 +475,8 @@ class Fusion:
         if reason is not None:
             self._drop(laser.name, reason)
             return None
+        if not laser.nothing_is_free:
+            distance[np.isposinf(distance)] = np.nan
         measured = np.isfinite(distance)
         impossible = measured & ((distance <= 0.0) | (distance > reading.range_max_m * (1.0 + 1e-9)))
         if impossible.any():

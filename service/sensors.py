@@ -11,6 +11,7 @@ from mapping.frames import Pose2
 class Laser:
     """A 2D laser. upside_down: mounted head down, its bearings count clockwise seen from above.
 
+    nothing_is_free: where it says that it saw nothing, there is nothing; else nothing is known.
     tilts: it sits on a mount that nods or turns: its sweeps make a cloud of points, and go into no flat map.
     """
 
@@ -18,6 +19,7 @@ class Laser:
     base_from_sensor: Pose2
     height_m: float = 0.0
     upside_down: bool = False
+    nothing_is_free: bool = True
     tilts: bool = False
 
     kind = "laser"

@@ -37,6 +37,7 @@ def test_the_ledger_is_long_enough_and_its_page_tells_all_of_it() -> None:
     assert len(COMMITTED) == len(CELLS) >= 120
     assert all(each["holds"] for each in COMMITTED)
     text = PAGE.read_text()
+    assert "## What no driver can see" in text
     assert f"{len(CELLS)} cells, {len(CELLS)} of them hold." in text
     for each in COMMITTED:
         assert f"## {each['device']}\n" in text
@@ -46,13 +47,13 @@ def test_the_ledger_is_long_enough_and_its_page_tells_all_of_it() -> None:
 # Faults of devices and wires, with any value; what a device could truly see is left to the maps' own tests.
 WIRE = ["unplug", "rename", "busy", "no_permission", "power_cycle", "brown_out", "slow_boot", "silence", "stall"]
 BYTES = ["single_bytes", "short_reads", "bursts", "drop", "add", "flip", "wrong_baud", "flood"]
-BEAMS = ["lost_sector", "ghost", "black", "dust", "sun", "slow_blinding"]
+BEAMS = ["lost_sector", "ghost", "black", "glass", "dust", "sun", "slow_blinding"]
 HEAD = ["clock_drift", "speed", "varying_speed", "varying_count", "trouble"]
 NODE = ["unplug", "power_cycle", "brown_out", "slow_boot", "silence", "stall", "drop", "add"]
 BUS = ["unplug", "silence", "stall", "drop", "add", "power_cycle", "slow_boot", "brown_out", "bus_off", "flood"]
 COUNTS = ["wrap", "reset", "alarm"]
 LIES = {
-    "frozen", "delay", "glass", "mixed_pixels", "interference", "stuck", "specular", "chain_break", "order_swap",
+    "frozen", "delay", "mixed_pixels", "interference", "stuck", "specular", "chain_break", "order_swap",
     "temperature", "cross_talk", "sign", "swap", "missed_counts", "slip", "size_change", "id_clash",
 }  # fmt: skip
 SWITCHES = {"bounce", "stuck_on", "stuck_off"}
@@ -61,7 +62,8 @@ VALUES = {
     "brown_out": (0.05, 0.5), "bursts": (0.01, 0.4), "short_reads": (1.0, 300.0),
     "single_bytes": (1000.0, 30000.0), "speed": (0.8, 1.1),
     "varying_speed": (0.01, 0.15), "varying_count": (0.01, 0.15), "ghost": (0.2, 1.9), "dust": (0.01, 0.9),
-    "sun": (0.1, 1.0), "slow_blinding": (0.1, 2.0), "clock_drift": (-2000.0, 2000.0), "wrap": (-500.0, 500.0),
+    "glass": (0.1, 1.0), "sun": (0.1, 1.0), "slow_blinding": (0.1, 2.0), "clock_drift": (-2000.0, 2000.0),
+    "wrap": (-500.0, 500.0),
 }  # fmt: skip
 
 

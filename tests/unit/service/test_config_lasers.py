@@ -118,3 +118,12 @@ def test_the_motor_line_of_an_rplidar_on_a_port_without_one(tmp_path: Path) -> N
     finally:
         os.close(master)
         os.close(slave)
+
+
+@pytest.mark.parametrize("driver", ["hokuyo", "sick_lms2xx"])
+def test_what_a_laser_says_of_nothing_may_be_doubted(tmp_path: Path, driver: str) -> None:
+    for no_echo, free in (("clear", True), ("unknown", False)):
+        text = f'[lasers.front]\ndriver = "{driver}"\nport = "/dev/ttyUSB0"\nno_echo = "{no_echo}"\n'
+        front = sensors(load_text(tmp_path, text))["front"]
+        assert isinstance(front, Laser)
+        assert front.nothing_is_free is free

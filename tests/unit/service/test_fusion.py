@@ -483,3 +483,16 @@ def test_poses_compose_one_by_one_as_they_do_together() -> None:
         for row, pose in zip(got, expected):
             assert row[:2] == pytest.approx([pose.x_m, pose.y_m])
             assert math.cos(row[2] - pose.yaw_rad) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("nothing_is_free", [True, False])
+def test_nothing_seen_is_free_or_unknown_as_configured(nothing_is_free: bool) -> None:
+    laser = replace(LASER, nothing_is_free=nothing_is_free)
+    fusion = Fusion(Parts(sensors={"front": laser}))
+    told = [
+        out.scan
+        for out in fusion.on_item("front", scan(1000 * MS, range_m=np.inf), 1000 * MS)
+        if isinstance(out, ScanOut)
+    ]
+    assert np.isposinf(told[0].range_m).all() == nothing_is_free
+    assert np.isnan(told[0].range_m).all() != nothing_is_free
