@@ -163,6 +163,31 @@ export function drawLoops(g2, camera, graph) {
   g2.globalAlpha = 1;
 }
 
+// Places and the ways driven between them, or regions and the passages: doors are drawn stronger.
+export function drawTopo(g2, camera, topo) {
+  const at = new Map(topo.nodes.map((node) => [node.id, camera.toScreen(...node.position)]));
+  g2.strokeStyle = colours["sector-free"];
+  g2.lineWidth = 1;
+  g2.globalAlpha = 0.5;
+  for (const node of topo.nodes.filter((n) => n.polygon)) {
+    g2.beginPath();
+    for (const corner of node.polygon) g2.lineTo(...camera.toScreen(...corner));
+    g2.closePath();
+    g2.stroke();
+  }
+  for (const edge of topo.edges) {
+    const middle = edge.ends ? [camera.toScreen((edge.ends[0][0] + edge.ends[1][0]) / 2, (edge.ends[0][1] + edge.ends[1][1]) / 2)] : [];
+    g2.globalAlpha = edge.is_door ? 1 : 0.7;
+    g2.lineWidth = edge.is_door ? 2.5 : 1.5;
+    g2.beginPath();
+    for (const point of [at.get(edge.from), ...middle, at.get(edge.to)]) if (point) g2.lineTo(...point);
+    g2.stroke();
+  }
+  g2.fillStyle = colours["sector-free"];
+  g2.globalAlpha = 1;
+  for (const [px, py] of at.values()) { g2.beginPath(); g2.arc(px, py, 3, 0, 2 * Math.PI); g2.fill(); }
+}
+
 export function compose(a, b) {
   const c = Math.cos(a.yaw), s = Math.sin(a.yaw);
   return { x: a.x + c * b.x - s * b.y, y: a.y + s * b.x + c * b.y, yaw: a.yaw + b.yaw };

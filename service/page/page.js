@@ -22,6 +22,7 @@ class Robot {
     this.polar = new Map();
     this.grid = new draw.GridImage();
     this.graph = null;
+    this.topo = null;
     this.seen = new Map(); // when a device's newest reading came here
   }
 
@@ -61,7 +62,7 @@ const robots = new Map();
 let shown = null;
 let changed = true;
 const camera = new draw.Camera($("map"));
-const layers = { grid: true, scan: true, sonar: true, sectors: true, trail: true, loops: true };
+const layers = { grid: true, scan: true, sonar: true, sectors: true, trail: true, loops: true, topo: true };
 let follow = false;
 let ringMap = null;
 
@@ -100,6 +101,7 @@ const HANDLERS = [
     if (epochOf(attachment) === robot.grid.epoch) robot.grid.update(cdr.occupancyGridUpdate(payload));
   }],
   [/^map\/graph$/, (robot, payload) => robot.setGraph(json(payload))],
+  [/^map\/topo$/, (robot, payload) => { robot.topo = json(payload); }],
   [/^health\/json$/, (robot, payload) => takeHealth(robot, json(payload))],
   [/^info$/, (robot, payload) => { robot.info = json(payload); }],
 ];
@@ -290,6 +292,11 @@ function drawMap(robot) {
     draw.drawTrail(g2, camera, robot.trail);
   }
   if (layers.loops && robot.graph) draw.drawLoops(g2, camera, robot.graph);
+  if (layers.topo && robot.topo) {
+    draw.drawTopo(g2, camera, robot.topo);
+    const [x, y, yaw] = robot.topo.robot ?? [];
+    if (!robot.pose && yaw !== undefined) draw.drawRobot(g2, camera, { x, y, yaw }, robot.footprint);
+  }
   if (robot.pose) {
     if (layers.sonar) drawCones(g2, robot);
     if (layers.scan) drawScans(g2, robot);
