@@ -22,6 +22,15 @@ GUARD = 1e-4  # distance; far above what 32-bit coordinates and sums in up to 10
 
 
 @njit(cache=True, nogil=True)
+def in_unit_cube(vector: Any) -> bool:
+    """Whether all components lie in [0, 1]; NaN does not."""
+    for r in range(vector.shape[0]):  # noqa: SIM110 - compiled as it stands
+        if not 0.0 <= vector[r] <= 1.0:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
 def squared_up_to(node: Any, query: Any, limit: float) -> float:
     """Squared distance, summed in order; inf as soon as it is above the limit."""
     total = 0.0

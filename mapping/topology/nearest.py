@@ -94,7 +94,7 @@ class NearestNodes:
         v = np.ascontiguousarray(vector, dtype=np.float64)
         if v.shape != (self.dimensions,):
             raise ValueError(f"a scene vector has {self.dimensions} components, got shape {v.shape}")
-        if not (v.min() >= 0.0 and v.max() <= 1.0):  # NaN fails both
+        if not kernels.in_unit_cube(v):
             raise ValueError("components of a scene vector lie in [0, 1]")
         return v
 
