@@ -14,7 +14,7 @@ from numba import njit
 
 WORD = 64  # nodes in a word of marks
 BLOCK = 1024  # nodes whose sums stay in the first-level cache while all directions are added
-LARGEST = 127.0  # code: seven bits, see lead_sums
+LARGEST_FIRST, LARGEST = 255.0, 127.0  # code: eight bits in the first, widest group, else seven; see lead_sums
 GROUP = 8  # directions that are added at a time
 MOST_SHIFT = 8  # of a group's squares: sums of 16 groups stay below FAR
 FAR = 1 << 30  # above every sum
@@ -147,7 +147,7 @@ def turn(vector: Any, centre: Any, axes: Any, row: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def code(row: Any, origin: Any, steps: Any, codes: Any, errors: Any) -> None:
-    """Coordinates as seven bits a direction, and how far that is off, summed up to each group of directions.
+    """Coordinates as seven or eight bits a direction, and how far that is off, summed up to each group of directions.
 
     origin: (m,) of the box, m = GROUP * groups.  steps: (groups,).  codes: (m,) uint8, written.  errors: (groups,),
     written: length of the rounding error in the directions up to this group; clipping is not counted, it brings no
@@ -156,7 +156,7 @@ def code(row: Any, origin: Any, steps: Any, codes: Any, errors: Any) -> None:
     squared = 0.0
     for d in range(codes.shape[0]):
         step = steps[d // GROUP]
-        inside = min(max((row[d] - origin[d]) / step, 0.0), LARGEST)
+        inside = min(max((row[d] - origin[d]) / step, 0.0), LARGEST_FIRST if d < GROUP else LARGEST)
         whole = np.floor(inside + 0.5)
         codes[d] = np.uint8(whole)
         squared += ((inside - whole) * step) ** 2
@@ -197,11 +197,23 @@ def lead_sums(columns: Any, query: Any, lead: int, shifts: Any, part: Any) -> An
     """Squared differences of the first `lead` groups of the nodes of a block, into part; the least of them.
 
     columns: (m, BLOCK).  part: (nodes,) int32.  Four squares of 7-bit numbers fit in 16 bits, of which a vector
-    register holds twice as many as of 32: this is what the codes leave their eighth bit unused for.
+    register holds twice as many as of 32: this is what most codes leave their eighth bit unused for. The first group
+    has the widest directions, whose rounding would count most, and uses it.
     """
     count = part.shape[0]
-    part[:] = 0
-    for d in range(0, lead * GROUP, 8):
+    for j in range(count):
+        part[j] = 0
+    first_by = np.int32(shifts[0])
+    for d in range(0, GROUP, 4):
+        e0, e1, e2, e3 = columns[d], columns[d + 1], columns[d + 2], columns[d + 3]
+        p0, p1, p2, p3 = np.int16(query[d]), np.int16(query[d + 1]), np.int16(query[d + 2]), np.int16(query[d + 3])
+        for j in range(count):
+            b0, b1 = np.int16(np.int16(e0[j]) - p0), np.int16(np.int16(e1[j]) - p1)
+            b2, b3 = np.int16(np.int16(e2[j]) - p2), np.int16(np.int16(e3[j]) - p3)
+            one = np.int32(np.int32(np.uint16(b0 * b0)) + np.int32(np.uint16(b1 * b1)))
+            two = np.int32(np.int32(np.uint16(b2 * b2)) + np.int32(np.uint16(b3 * b3)))
+            part[j] += np.int32(np.int32(one + two) << first_by)
+    for d in range(GROUP, lead * GROUP, GROUP):
         by = np.int32(shifts[d // GROUP])
         c0, c1, c2, c3 = columns[d], columns[d + 1], columns[d + 2], columns[d + 3]
         c4, c5, c6, c7 = columns[d + 4], columns[d + 5], columns[d + 6], columns[d + 7]

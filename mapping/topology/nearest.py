@@ -6,7 +6,7 @@ Two structures are kept beside the nodes, both updated node by node:
   stands, as bits, which nodes have a component within reach D of it. A node nearer than D is marked in all
   dimensions, so if none is, none is that near. With k such that an interval is D wide this is the book's
   (q - 1) .. (q + 2); narrower intervals, the default, leave fewer candidates for the same number of bits read.
-- Bounds: the nodes turned into their principal directions, in seven bits a number, the widest directions first.
+- Bounds: the nodes turned into their principal directions, in seven or eight bits a number, the widest first.
   Turning changes no distance; leaving directions out and clipping make none longer; the error of rounding is known:
   what remains is a bound below the distance. Few nodes are still in question after that; these are compared by their
   turned coordinates, and read in full where rounding those to 32 bits leaves a doubt.
@@ -217,7 +217,7 @@ class _Marks:
 
 
 class _Bounds:
-    """Nodes in their principal directions, seven bits each, for sums that are below the distances.
+    """Nodes in their principal directions, seven or eight bits each, for sums that are below the distances.
 
     Directions come in groups of eight, the widest first; a group has a step of its own, the smallest times a power of
     two, so that narrow directions are rounded less. `errors` holds, up to each group, the longest rounding error of
@@ -306,9 +306,11 @@ class _Bounds:
 
 def _steps(widths: F64) -> tuple[F64, NDArray[np.int64]]:
     """Steps of groups as wide as told, and how far their squares are shifted against those of the smallest."""
-    widths = np.maximum(widths, 1e-9)
-    halvings = np.minimum(np.floor(np.log2(widths.max() / widths)), kernels.MOST_SHIFT // 2)
-    return float(widths.max()) / kernels.LARGEST / 2.0**halvings, (2 * (halvings.max() - halvings)).astype(np.int64)
+    levels = np.full(len(widths), kernels.LARGEST)
+    levels[0] = kernels.LARGEST_FIRST
+    fitting = np.maximum(widths, 1e-9) / levels
+    halvings = np.minimum(np.floor(np.log2(fitting.max() / fitting)), kernels.MOST_SHIFT // 2)
+    return float(fitting.max()) / 2.0**halvings, (2 * (halvings.max() - halvings)).astype(np.int64)
 
 
 def _grown(array: NDArray[Any], *, axis: int) -> NDArray[Any]:
