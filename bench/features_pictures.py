@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -151,11 +152,25 @@ def save(figure: Any, path: Path) -> None:
     plt.close(figure)
 
 
+def telling(scans: Iterable[Scan]) -> Scan:
+    """The scan with most anchors among those that show a box and a virtual edge."""
+    best, most = None, -1
+    for scan in scans:
+        scene = square_scene(points_of(scan)[0])
+        if scene is None or box_feature(scene) is None or not len(virtual_edges(scene)):
+            continue
+        count = len(sight_of(scan).graph)
+        if count > most:
+            best, most = scan, count
+    assert best is not None
+    return best
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/pictures"))
     folder = parser.parse_args().out
-    one_scan(folder, posed_scans("fr079")[3500][0])
+    one_scan(folder, telling(scan for scan, _ in spaced(posed_scans("fr079"))))
     found_place(folder)
 
 
