@@ -834,9 +834,11 @@ def warm_up(config: Config) -> None:
 
         warm_up_in_map()
     elif config.slam.enabled and any(isinstance(sensor, Laser) for sensor in found.values()):
+        from mapping.grids.warm_up import warm_up as warm_up_grids
         from mapping.localise.warm_up import warm_up as warm_up_slam
 
         warm_up_slam()
+        warm_up_grids()
     fusion = Fusion(parts(config, found, maps(config, found), OdometryOnly()))
     now_ns = 0
     for step in range(4):  # standing, then moving: the two take different kernels

@@ -31,6 +31,7 @@ def warm_up(model: Model = "counters") -> None:
     grid.decay()
     for row, col, payload in list(grid.tiles()):
         grid.load_tile(row, col, payload)
+    grid.empty_copy().take_tiles(grid, grid.places())
     clearance_layer(grid.patch())
     field = DistanceField(np.eye(3, dtype=np.bool_))
     field.update([(0, 1), (0, 2)], [(0, 0), (1, 1)])

@@ -9,6 +9,7 @@ import numpy as np
 from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
 from mapping.localise.in_map import MapLocaliser
+from mapping.localise.kept_sweeps import kept_sweep
 from mapping.localise.known_map import known_map, points_of
 from mapping.localise.scan_match import agreement, match_view
 from mapping.localise.search import find_view, raster_of
@@ -38,6 +39,8 @@ def warm_up() -> None:
         raster = raster_of(snapshot.views, rows, snapshot.poses, window_m=window_m)
         find_view(view, raster, Pose2(), window_m=window_m, turn_rad=0.1)
     slam.finish()
+    kept = kept_sweep("", scan, key=0, in_key=np.zeros((2, 3)))
+    kept.poses(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.1]]), np.zeros(3))
 
 
 def warm_up_in_map() -> None:
