@@ -111,6 +111,7 @@ class Metered(SlamLocaliser):
 
 def measure(seconds: float) -> dict[str, float]:
     """Play in real time; see the module's text."""
+    sys.setswitchinterval(0.001)  # as the daemon does
     items = readings(seconds)
     assemble.warm_up(CONFIG)
     beside_ns: list[int] = []
