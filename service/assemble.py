@@ -574,6 +574,11 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         seen_by = [each for each in found.values() if isinstance(each, Laser) and each.name in fed_by]
         mounts = {each.name: each.base_from_sensor for each in seen_by}
         makers.append(SceneMaker(mounts, most=config.scenes.most, period_ns=round(config.scenes.period_s * 1e9)))
+    if config.rooms.enabled and config.grid.enabled:
+        from service.room_maker import RoomMaker
+
+        rooms = config.rooms
+        makers.append(RoomMaker(period_ns=round(rooms.period_s * 1e9), clearance_m=rooms.clearance_m))
     return makers
 
 
@@ -829,6 +834,10 @@ def warm_up(config: Config) -> None:
         from mapping.features.warm_up import warm_up as warm_up_features
 
         warm_up_features()
+    if config.rooms.enabled and config.grid.enabled:
+        from mapping.hybrid.warm_up import warm_up as warm_up_rooms
+
+        warm_up_rooms()
     if config.localise.mode == "map":
         from mapping.localise.warm_up import warm_up_in_map
 

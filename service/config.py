@@ -41,6 +41,7 @@ from service.config_maps import (
     LocalGrid,
     LocaliseIn,
     PlaneMapSettings,
+    RoomMapSettings,
     SceneMapSettings,
     SectorMaps,
     SlamLive,
@@ -73,6 +74,7 @@ class Config(Section):
     planes: PlaneMapSettings = Field(default=PlaneMapSettings(), description="Planes of tilting lasers.")
     topo: TopoMapSettings = Field(default=TopoMapSettings(), description="Regions of free space and ways between them.")
     scenes: SceneMapSettings = Field(default=SceneMapSettings(), description="Scenes to be recognised again.")
+    rooms: RoomMapSettings = Field(default=RoomMapSettings(), description="Rooms, doors, plans.")
     slam: SlamLive = Field(default=SlamLive(), description="Where the robot is, by laser scans.")
     localise: LocaliseIn = Field(default=LocaliseIn(), description="Finding the robot in a given map.")
     alignment: Alignment = Field(default=Alignment(), description="How long readings wait for each other.")

@@ -136,6 +136,14 @@ class SceneMapSettings(Section):
     most: int = Field(default=5000, ge=1, le=20000, description="Scenes that are kept; later ones are left out.")
 
 
+class RoomMapSettings(Section):
+    """Rooms and doors with ids and names that stay: key map/rooms, calls @rpc/plan and @rpc/name_room. Needs [grid]."""
+
+    enabled: bool = Field(default=False, description="Keep it.")
+    period_s: float = Field(default=5.0, ge=1.0, le=3600, description="Shortest time between two that are made.")
+    clearance_m: float = Field(default=0.3, ge=0.0, le=10.0, description="What plans keep off, if they are not told.")
+
+
 class SlamLive(Section):
     """Where the robot is: found by laying laser scans on each other, not by the wheels alone."""
 

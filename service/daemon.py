@@ -44,6 +44,7 @@ from service.outputs import HealthOut, Output
 from service.payloads import RobotInfo, SensorPlace
 from service.publisher import Publisher
 from service.recording import RecordedFusion, Recorder
+from service.room_maker import RoomMaker
 from service.ros import RosSettings
 from service.rpc import CallRefused
 from service.sensors import Chain, Laser
@@ -149,6 +150,9 @@ class Daemon:
         for maker in makers:
             if isinstance(maker, TopoMaker):
                 self._publisher.calls.register("route", partial(self._on_route, maker))
+            elif isinstance(maker, RoomMaker):
+                self._publisher.calls.register("plan", partial(self._on_plan, maker))
+                self._publisher.calls.register("name_room", partial(self._on_name_room, maker))
         if store is not None:
             self._makers.restore(store.load_tiles)
         background = Background()
@@ -271,6 +275,20 @@ class Daemon:
 
     def _on_route(self, maker: TopoMaker, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return self._makers.ask(partial(maker.route, arguments))
+
+    def _on_plan(self, maker: RoomMaker, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        return self._makers.ask(partial(maker.plan, arguments))
+
+    def _on_name_room(self, maker: RoomMaker, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Name a room, and tell everybody at once."""
+
+        def work() -> Mapping[str, Any]:
+            answer = maker.name_room(arguments)
+            for output in maker.news():
+                self._publisher.offer(output)
+            return answer
+
+        return self._makers.ask(work)
 
     def _on_record_start(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Begin a recording on request; every device is set up anew, so that its set-up is in it."""

@@ -221,7 +221,7 @@ def load_pgm_yaml(yaml_path: Path) -> MapImage:
     if not isinstance(origin, list) or len(origin) not in (2, 3):
         raise MapFileTrouble(f"{where}: origin {origin!r}: must be [x, y, yaw]")
     x, y, yaw = (_as_number(value, "origin", where) for value in (*origin, 0.0)[:3])
-    pixels, opaque = _read_pixels(yaml_path.parent / image_name)
+    pixels, opaque = read_pixels(yaml_path.parent / image_name)
     cells = interpret_pixels(
         pixels,
         opaque,
@@ -246,7 +246,7 @@ def load_map(path: Path, *, resolution_m: float | None = None) -> MapImage:
         return load_pgm_yaml(sidecar)
     if resolution_m is None or not (math.isfinite(resolution_m) and 1e-4 <= resolution_m <= 100.0):
         raise MapFileTrouble(f"{path}: has no {sidecar.name} beside it; say metres a pixel with --resolution-m 0.05")
-    pixels, opaque = _read_pixels(path)
+    pixels, opaque = read_pixels(path)
     cells = interpret_pixels(
         pixels,
         opaque,
@@ -296,7 +296,7 @@ def interpret_pixels(
     return cells.astype(np.int8)
 
 
-def _read_pixels(path: Path) -> tuple[F64, NDArray[np.bool_]]:
+def read_pixels(path: Path) -> tuple[F64, NDArray[np.bool_]]:
     """Brightness (0 to 1) and opacity of a picture of any usual kind."""
     from PIL import Image, UnidentifiedImageError
 

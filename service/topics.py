@@ -21,6 +21,7 @@ JSON_GRAPH = "application/json;umfeld.graph.v1"
 JSON_PLANES = "application/json;umfeld.planes.v1"
 JSON_TOPO = "application/json;umfeld.topo.v1"
 JSON_LOCALISATION = "application/json;umfeld.localisation.v1"
+JSON_ROOMS = "application/json;umfeld.rooms.v1"
 JSON_REPLY = "application/json;umfeld.reply.v1"
 
 _CHUNK = re.compile(r"[a-z0-9_-]+\Z")
@@ -281,6 +282,16 @@ MAP_TOPO = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+MAP_ROOMS = Topic(
+    "map/rooms",
+    "umfeld.rooms.v1",
+    JSON_ROOMS,
+    "at most every 5 s, on change",
+    "Rooms of the grid with ids and names that stay, and the doors between them; if configured.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 HEALTH = Topic(
     "health",
     DIAGNOSTICS,
@@ -341,6 +352,7 @@ TOPICS: tuple[Topic, ...] = (
     LOCALISATION,
     MAP_PLANES,
     MAP_TOPO,
+    MAP_ROOMS,
     HEALTH,
     HEALTH_JSON,  # before health/<sensor>: the exact key wins
     HEALTH_ONE,

@@ -248,6 +248,53 @@ def elevation(
     _tell(found.report, [write_extracted(found, path) for path in (out, _as_png(png)) if path is not None], as_json)
 
 
+@app.command()
+def rooms(
+    file: Annotated[Path, typer.Argument(help="A grid map: .yaml with its .pgm, or a picture, white free.")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=".geojson; default: to the screen.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw them, too.")] = None,
+    resolution_m: Annotated[float, typer.Option(min=0.005, max=1.0, help="Of a picture without .yaml.")] = 0.05,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON; needs --out or --png.")] = False,
+) -> None:
+    """Rooms of a grid map and the doors between them.
+
+    Example: umfeld extract rooms map.yaml --out rooms.geojson --png rooms.png
+    """
+    _extract_rooms(file, out, png, resolution_m, as_json, with_diagram=False)
+
+
+@app.command()
+def voronoi(
+    file: Annotated[Path, typer.Argument(help="A grid map: .yaml with its .pgm, or a picture, white free.")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=".geojson; default: to the screen.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw them, too.")] = None,
+    resolution_m: Annotated[float, typer.Option(min=0.005, max=1.0, help="Of a picture without .yaml.")] = 0.05,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON; needs --out or --png.")] = False,
+) -> None:
+    """The Voronoi diagram of a grid map as a graph, with the rooms and doors it yields.
+
+    Example: umfeld extract voronoi map.yaml --out voronoi.geojson --png voronoi.png
+    """
+    _extract_rooms(file, out, png, resolution_m, as_json, with_diagram=True)
+
+
+def _extract_rooms(
+    file: Path, out: Path | None, png: Path | None, resolution_m: float, as_json: bool, *, with_diagram: bool
+) -> None:
+    from service.errors import WrongUsage
+    from service.room_files import geojson_bytes, rooms_of_file, write_rooms
+
+    if as_json and out is None and png is None:
+        raise WrongUsage("--json reports on files: say where with --out or --png (without them GeoJSON is printed)")
+    found = rooms_of_file(file, resolution_m=resolution_m, with_diagram=with_diagram)
+    if out is None and png is None:
+        typer.echo(geojson_bytes(found).decode(), nl=False)
+        return
+    _tell(found.report, [write_rooms(found, path) for path in (out, _as_png(png)) if path is not None], as_json)
+
+
 def _tell(facts: dict[str, object], written: Sequence[Receipt], as_json: bool) -> None:
     """The report on the screen."""
     if as_json:

@@ -188,6 +188,38 @@ export function drawTopo(g2, camera, topo) {
   for (const [px, py] of at.values()) { g2.beginPath(); g2.arc(px, py, 3, 0, 2 * Math.PI); g2.fill(); }
 }
 
+// Rooms in tints of their id, doors across their openings, and the graph: from the middle of a room through a door to the next.
+export function drawRooms(g2, camera, map) {
+  const at = new Map(map.rooms.map((room) => [room.id, room.position]));
+  for (const room of map.rooms) {
+    g2.fillStyle = `hsl(${(room.id * 137) % 360} 60% 55%)`;
+    g2.globalAlpha = 0.18;
+    g2.beginPath();
+    for (const [x, y] of room.outline) g2.lineTo(...camera.toScreen(x, y));
+    g2.fill();
+  }
+  g2.globalAlpha = 0.8;
+  g2.strokeStyle = g2.fillStyle = colours.soft;
+  g2.lineWidth = 1;
+  for (const door of map.doors) {
+    g2.beginPath();
+    for (const [x, y] of [at.get(door.rooms[0]), door.position, at.get(door.rooms[1])]) g2.lineTo(...camera.toScreen(x, y));
+    g2.stroke();
+  }
+  g2.strokeStyle = colours.cone;
+  g2.lineWidth = 3;
+  for (const door of map.doors) {
+    g2.beginPath();
+    for (const [x, y] of door.ends) g2.lineTo(...camera.toScreen(x, y));
+    g2.stroke();
+  }
+  g2.globalAlpha = 1;
+  g2.fillStyle = colours.ink;
+  g2.font = "12px sans-serif";
+  g2.textAlign = "center";
+  for (const room of map.rooms) g2.fillText(room.name ?? `room ${room.id}`, ...camera.toScreen(...room.position));
+}
+
 export function compose(a, b) {
   const c = Math.cos(a.yaw), s = Math.sin(a.yaw);
   return { x: a.x + c * b.x - s * b.y, y: a.y + s * b.x + c * b.y, yaw: a.yaw + b.yaw };

@@ -23,6 +23,7 @@ class Robot {
     this.grid = new draw.GridImage();
     this.graph = null;
     this.topo = null;
+    this.rooms = null;
     this.seen = new Map(); // when a device's newest reading came here
   }
 
@@ -62,7 +63,7 @@ const robots = new Map();
 let shown = null;
 let changed = true;
 const camera = new draw.Camera($("map"));
-const layers = { grid: true, scan: true, sonar: true, sectors: true, trail: true, loops: true, topo: true };
+const layers = { grid: true, scan: true, sonar: true, sectors: true, trail: true, loops: true, topo: true, rooms: true };
 let follow = false;
 let ringMap = null;
 
@@ -102,6 +103,7 @@ const HANDLERS = [
   }],
   [/^map\/graph$/, (robot, payload) => robot.setGraph(json(payload))],
   [/^map\/topo$/, (robot, payload) => { robot.topo = json(payload); }],
+  [/^map\/rooms$/, (robot, payload) => { robot.rooms = json(payload); }],
   [/^health\/json$/, (robot, payload) => takeHealth(robot, json(payload))],
   [/^info$/, (robot, payload) => { robot.info = json(payload); }],
 ];
@@ -287,6 +289,7 @@ function drawMap(robot) {
   frameWhenKnown(robot);
   if (follow && robot.pose) { camera.x = robot.pose.x; camera.y = robot.pose.y; }
   if (layers.grid) robot.grid.draw(g2, camera);
+  if (layers.rooms && robot.rooms) draw.drawRooms(g2, camera, robot.rooms);
   if (layers.trail) {
     if (robot.graph) draw.drawTrail(g2, camera, robot.graph.keys.map(([x, y]) => ({ x, y })));
     draw.drawTrail(g2, camera, robot.trail);

@@ -1,0 +1,157 @@
+"""Rooms of a grid as the daemon tells them, plans and names through the calls, and what the store keeps."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+
+from mapping.frames import Pose2
+from mapping.grids.patch import GridPatch
+from service import assemble
+from service.config import Config
+from service.map_makers import MapView, Rect
+from service.outputs import DocumentOut
+from service.room_maker import RoomMaker
+from service.rpc import CallRefused
+
+SCHEMA = json.loads((Path(__file__).parents[3] / "docs" / "schemas" / "rooms.v1.json").read_text())
+CELL_M = 0.1
+ROW0, COL0 = -30, 200
+
+
+def house(*, door: bool = True) -> GridPatch:
+    """Two rooms of 5 m x 5 m with a door of 1 m, unknown around; a table in the first."""
+    cells = np.full((60, 112), -1, dtype=np.int8)
+    cells[4:56, 3:109] = 100
+    cells[5:55, 4:54] = cells[5:55, 56:106] = 0
+    cells[20:25, 20:25] = 100
+    if door:
+        cells[25:35, 54:56] = 0
+    return GridPatch(CELL_M, ROW0, COL0, cells)
+
+
+def told(maker: RoomMaker, grid: GridPatch | None, pose: Pose2 | None = None) -> dict[str, Any] | None:
+    """The document after a change of the grid, checked against its schema; None if nothing was said."""
+    changed = () if grid is None else (Rect(grid.row0, grid.col0, *grid.cells.shape),)
+    outputs = maker.make(MapView(7, grid, changed, pose))
+    if not outputs:
+        return None
+    (output,) = outputs
+    assert isinstance(output, DocumentOut)
+    document = {"schema": "umfeld.rooms.v1", "stamp": {"sec": 0, "nanosec": 7}, **output.fields}
+    jsonschema.validate(document, SCHEMA)
+    return document
+
+
+def at(row: int, col: int) -> list[float]:
+    return [(col + COL0 + 0.5) * CELL_M, (row + ROW0 + 0.5) * CELL_M]
+
+
+def test_rooms_and_their_door_are_told_once() -> None:
+    maker = RoomMaker()
+    assert told(maker, None) is None
+    document = told(maker, house())
+    assert document is not None
+    first, second = document["rooms"]
+    assert (first["id"], second["id"]) == (1, 2)
+    assert first["area_m2"] == pytest.approx(25.0, abs=0.7)
+    xs, ys = zip(*first["outline"])
+    assert (min(xs), min(ys)) == pytest.approx((20.4, -2.5), abs=0.11)
+    (door,) = document["doors"]
+    assert door["rooms"] == [1, 2]
+    assert door["width_m"] == pytest.approx(1.1, abs=0.1)
+    assert told(maker, house()) is None
+    closed = told(maker, house(door=False))
+    assert closed is not None
+    assert [room["id"] for room in closed["rooms"]] == [1, 2]
+    assert (closed["doors"], closed["version"]) == ([], 2)
+
+
+def test_a_plan_leads_through_the_door_by_position_id_or_name() -> None:
+    maker = RoomMaker(clearance_m=0.2)
+    with pytest.raises(CallRefused, match="no grid"):
+        maker.plan({"goal": 2})
+    x_m, y_m = at(10, 10)
+    told(maker, house(), Pose2(x_m, y_m, 0.0))
+    maker.name_room({"id": 2, "name": "kitchen"})
+    answer = maker.plan({"goal": "kitchen"})
+    assert answer["rooms"] == [1, 2]
+    assert answer["poses"][0][:2] == pytest.approx(at(10, 10), abs=0.001)
+    assert answer["least_clearance_m"] >= 0.2
+    assert len(answer["clearance_m"]) == len(answer["poses"])
+    assert maker.plan({"start": at(10, 10), "goal": 2}) == answer
+    assert maker.plan({"start": 2, "goal": at(10, 10)})["rooms"] == [2, 1]
+    json.dumps(answer, allow_nan=False)
+    told(maker, house(door=False))
+    with pytest.raises(CallRefused, match="no way"):
+        maker.plan({"start": at(10, 10), "goal": 2})
+
+
+def test_unknown_cells_are_not_planned_through() -> None:
+    maker, grid = RoomMaker(clearance_m=0.0), house()
+    grid.cells[25:35, 54:56] = -1
+    told(maker, grid)
+    with pytest.raises(CallRefused, match="no way"):
+        maker.plan({"start": at(10, 10), "goal": at(10, 100)})
+    with pytest.raises(CallRefused, match="not known to be free"):
+        maker.plan({"start": at(10, 10), "goal": at(0, 0)})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"goal": 9}, "no room 9"),
+        ({"goal": True}, "position"),
+        ({"goal": [1.0]}, "position"),
+        ({"goal": [float("nan"), 0.0]}, "position"),
+        ({}, "position"),
+        ({"goal": 2, "clearance_m": -1}, "clearance_m"),
+        ({"goal": 2, "alternatives": 1.5}, "alternatives"),
+        ({"goal": 2, "speed": 1}, "unknown argument"),
+        ({"goal": 2}, "where the robot is"),
+    ],
+)
+def test_bad_plans_are_refused_in_words(arguments: dict[str, object], words: str) -> None:
+    maker = RoomMaker()
+    told(maker, house())
+    with pytest.raises(CallRefused, match=words):
+        maker.plan({"start": at(10, 10), **arguments} if words != "where the robot is" else arguments)
+
+
+def test_names_are_told_kept_and_belong_to_one_room() -> None:
+    maker = RoomMaker()
+    told(maker, house())
+    assert maker.name_room({"id": 1, "name": " Küche "}) == {"id": 1, "name": "Küche"}
+    (news,) = maker.news()
+    assert isinstance(news, DocumentOut)
+    assert json.loads(json.dumps(news.fields))["rooms"][0]["name"] == "Küche"
+    with pytest.raises(CallRefused, match="room 1 is called 'Küche' already"):
+        maker.name_room({"id": 2, "name": "Küche"})
+    for arguments in ({"id": 9, "name": "x"}, {"id": 1}, {"id": 1, "name": "x" * 65}, {"id": True, "name": "x"}):
+        with pytest.raises(CallRefused):
+            maker.name_room(arguments)
+    tiles = maker.changed_tiles()
+    assert maker.changed_tiles() == []
+    again = RoomMaker()
+    again.restore(tiles)
+    document = told(again, house())
+    assert document is not None
+    assert [(room["id"], room["name"]) for room in document["rooms"]] == [(1, "Küche"), (2, None)]
+    again.restore(())
+    assert again.changed_tiles() == []
+    with pytest.raises(ValueError, match="damaged"):
+        again.restore([(0, 0, b"{")])
+    with pytest.raises(ValueError, match="territory"):
+        again.restore([(0, 0, b'{"next": 2, "names": {}}'), (1, 0, b"rubbish")])
+
+
+def test_it_is_built_from_the_configuration() -> None:
+    assert not any(isinstance(maker, RoomMaker) for maker in assemble.map_makers(Config(), {}))
+    config = Config.model_validate({"rooms": {"enabled": True, "period_s": 2.0}})
+    (maker,) = (m for m in assemble.map_makers(config, {}) if isinstance(m, RoomMaker))
+    assert maker.period_ns == 2_000_000_000
