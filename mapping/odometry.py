@@ -107,11 +107,9 @@ class DifferentialOdometry:
         track = self._geometry.track_width_m
         forward, turn = (left_m + right_m) / 2.0, (right_m - left_m) / track
         step = exp_se2((forward, 0.0, turn))
-        heading = self._pose.yaw_rad + turn / 2.0  # of the chord
-        chord = math.hypot(step.x_m, step.y_m) * math.copysign(1.0, forward)
         noise = self._geometry.travel_noise_m_per_sqrt_m**2
         self._covariance = kernels.rolled_covariance(
-            self._covariance, heading, chord, track, noise * abs(left_m), noise * abs(right_m)
+            self._covariance, self._pose.yaw_rad, forward, turn, track, noise * abs(left_m), noise * abs(right_m)
         )
         self._pose = self._pose @ step
         return forward, turn

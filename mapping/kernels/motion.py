@@ -119,21 +119,28 @@ def seen_at_once(
 
 @njit(cache=True, nogil=True)
 def rolled_covariance(
-    covariance: Any, heading: float, chord: float, track: float, left_var: float, right_var: float
+    covariance: Any, yaw: float, way: float, turn: float, track: float, left_var: float, right_var: float
 ) -> Any:
     """Covariance (3, 3) of x, y, yaw after both wheels of a differential drive rolled on along an arc.
 
-    heading, chord: of the straight way between the arc's ends.  left_var, right_var: of the two travels, in m^2.
+    yaw: before it.  way: length of the arc.  turn: along it.  left_var, right_var: of the two travels, in m^2.
     """
-    c, s = math.cos(heading), math.sin(heading)
+    h = 0.5 * turn
+    if abs(h) < 1e-4:
+        share, bend = 1.0 - h * h / 6.0, -h / 3.0
+    else:
+        share, bend = math.sin(h) / h, (h * math.cos(h) - math.sin(h)) / (h * h)
+    chord = way * share
+    c, s = math.cos(yaw + h), math.sin(yaw + h)
     by_pose = np.eye(3)
     by_pose[0, 2], by_pose[1, 2] = -s * chord, c * chord
-    # Derivatives of the step by the two travels; the chord's own turn is half the step's.
-    half_x, half_y = s * chord / (2.0 * track), c * chord / (2.0 * track)
     by_travel = np.empty((3, 2))
-    by_travel[0, 0], by_travel[0, 1] = c / 2.0 + half_x, c / 2.0 - half_x
-    by_travel[1, 0], by_travel[1, 1] = s / 2.0 - half_y, s / 2.0 + half_y
-    by_travel[2, 0], by_travel[2, 1] = -1.0 / track, 1.0 / track
+    for wheel in range(2):
+        half = (-0.5 if wheel == 0 else 0.5) / track  # of the chord's own turn by this travel
+        longer = 0.5 * share + way * bend * half
+        by_travel[0, wheel] = c * longer - s * chord * half
+        by_travel[1, wheel] = s * longer + c * chord * half
+        by_travel[2, wheel] = 2.0 * half
     moved = np.zeros((3, 3))
     for row in range(3):
         for col in range(3):
