@@ -733,6 +733,10 @@ def localiser(
     matched = lasers.keys() & _sources(config, config.slam.sources, found)
     if not config.slam.enabled or not matched:
         return OdometryOnly(start_pose)
+    if config.slam.method == "lines":
+        from service.line_localiser import LineLocaliser
+
+        return LineLocaliser(matched, geometry_of(config.drive), start=start_pose)
     from service.redraw import Redrawer
     from service.slam_live import SlamLocaliser, stored_or_none
 

@@ -150,6 +150,11 @@ class SlamLive(Section):
     enabled: bool = Field(
         default=True, description="Do it, on a robot with a laser; false: believe the wheels, however they drift."
     )
+    method: Literal["scans", "lines"] = Field(
+        default="scans",
+        description="scans: scan matching, loops closed, maps drawn again. lines: a Kalman filter on straight walls, "
+        "for small computers; needs wheels, closes no loops.",
+    )
     sources: tuple[Reference, ...] | None = Field(default=None, description="Lasers that are matched; default: all.")
 
 

@@ -26,6 +26,7 @@ from service import assemble
 from service.background import Submit, at_once
 from service.config import Config
 from service.fusion import Fusion, StoredTile
+from service.line_localiser import LineLocaliser
 from service.outputs import DocumentOut, GridOut, GridUpdateOut, Output, PoseOut
 from service.recording import digest_of
 from service.slam_live import SlamLocaliser
@@ -331,6 +332,38 @@ def test_without_wheels_the_laser_alone_finds_the_way() -> None:
     assert len(made.poses) > 350
     assert np.quantile(pose_errors_m(driving, made.poses), 0.95) < 0.3  # sweeps are not de-skewed
     assert made.fusion.troubles(0) == []
+
+
+def test_lines_alone_hold_a_small_computers_robot() -> None:
+    """`[slam] method = "lines"`: far better than the wheels, with an uncertainty that holds."""
+    driving = drive("office", 0.4)
+    config = CONFIG.model_copy(update={"slam": CONFIG.slam.model_copy(update={"method": "lines"})})
+    errors = {}
+    for method, chosen in (
+        ("lines", config),
+        ("wheels", CONFIG.model_copy(update={"slam": CONFIG.slam.model_copy(update={"enabled": False})})),
+    ):
+        sensors = assemble.sensors(chosen)
+        maps = assemble.maps(chosen, sensors)
+        localiser = assemble.localiser(chosen, sensors, maps, driving.truth(0), at_once)
+        fusion = Fusion(assemble.parts(chosen, sensors, maps, localiser))
+        poses: list[PoseOut] = []
+        now_ns = 0
+        for source, reading in driving.items:
+            last = reading.stamp_ns + (SWEEP_MS * MS if isinstance(reading, ScanReading) else 0)
+            now_ns = max(now_ns, last) + MS
+            poses += [each for each in fusion.on_item(source, reading, now_ns) if isinstance(each, PoseOut)]
+            fusion.settle(now_ns)
+        assert localiser.troubles() == []
+        errors[method] = pose_errors_m(driving, poses)
+        if method == "lines":
+            assert isinstance(localiser, LineLocaliser)
+            off = [pose.map_from_base.inverse() @ driving.truth(pose.stamp_ns) for pose in poses]
+            spread = np.array([math.sqrt(np.trace(pose.covariance[:2, :2])) for pose in poses])
+            far = np.array([math.hypot(each.x_m, each.y_m) for each in off]) > 3.0 * spread + 0.02
+            assert far.mean() < 0.05
+    assert np.quantile(errors["lines"], 0.95) < 0.08
+    assert np.quantile(errors["lines"], 0.95) < 0.1 * np.quantile(errors["wheels"], 0.95)
 
 
 # --- going on in a stored map
