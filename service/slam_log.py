@@ -49,7 +49,7 @@ def run_slam(
     spent_ns = np.zeros(len(scans), dtype=np.int64)
     for index, logged in enumerate(scans):
         began = time.thread_time_ns()
-        scan = _scan(log, logged)
+        scan = scan_of(log, logged)
         pending = run_here(slam, scan.stamp_ns, pending)
         slam.add_scan(scan, mount, Pose2(*logged.robot_pose) if has_odometry else None)
         work = slam.take_work()
@@ -67,7 +67,8 @@ def run_slam(
     return SlamRun(poses, slam, _figures(slam, scans, spent_ns, finishing_s, has_odometry=has_odometry))
 
 
-def _scan(log: Log, logged: LogScan) -> Scan:
+def scan_of(log: Log, logged: LogScan) -> Scan:
+    """A log's sweep, taken as swept at once: logs do not tell their beams' times."""
     stamp_ns = round(logged.stamp_s * 1e9)
     return Scan(stamp_ns, 0.0, logged.bearing_rad, logged.range_m, NEAREST_M, log.range_max_m)
 
