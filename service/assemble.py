@@ -630,6 +630,17 @@ def maker_calls(makers: Sequence[MapMaker], slow: MapMakers) -> Iterator[tuple[s
             yield "where_am_i", partial(_ask, slow, maker.where_am_i)
 
 
+def closure_calls(localiser: Localiser, ask: Callable[[Callable[[], Any]], Any]) -> Iterator[tuple[str, Handler]]:
+    """Calls about the closures of a daemon that does SLAM, by name. ask: runs a function on the fusion thread."""
+    if isinstance(localiser, OdometryOnly):
+        return
+    from service.slam_live import SlamLocaliser
+
+    if isinstance(localiser, SlamLocaliser):
+        yield "list_closures", lambda _arguments: ask(localiser.closures_told)
+        yield "undo_closure", lambda arguments: ask(partial(localiser.undo, arguments))
+
+
 def _ask(slow: MapMakers, answer: Handler, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     return slow.ask(partial(answer, arguments))
 

@@ -196,7 +196,8 @@ class Daemon:
 
             assert isinstance(localiser, KnownMapLocaliser)
             self._publisher.calls.register("relocalise", partial(relocalise, localiser, self._worker.ask))
-        for name, answer in assemble.maker_calls(makers, self._makers):
+        closure_calls = assemble.closure_calls(localiser, self._worker.ask)
+        for name, answer in (*closure_calls, *assemble.maker_calls(makers, self._makers)):
             self._publisher.calls.register(name, answer)
         self._publisher.calls.register("record_start", self._on_record_start)
         self._publisher.calls.register("record_stop", lambda _arguments: self._end_recording())

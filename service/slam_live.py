@@ -13,17 +13,18 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
-from mapping.localise.closures import WorkResult
+from mapping.localise.closures import Closure, WorkResult
 from mapping.localise.placing import Placing
 from mapping.localise.slam import Slam, SlamSettings, SlamUpdate
 from mapping.odometry import OdometryState
@@ -33,6 +34,7 @@ from service.background import Submit
 from service.fusion import Located, Round, StoredTile, Touch, compose_many, located_by_odometry
 from service.outputs import DocumentOut, Output
 from service.redraw import Redrawer
+from service.rpc import CallRefused
 from service.slam_store import Keeper, Stored, stored_of
 
 log = logging.getLogger(__name__)
@@ -97,10 +99,17 @@ class SlamLocaliser:
         self._searched: tuple[int, Pose2] | None = None  # stamp and odometry of the last search
         self._searches = 0
         self._hypotheses: tuple[Pose2, tuple[Pose2, ...]] = (IDENTITY, ())  # odometry, and where the base may be then
+        self._asked_to_undo: set[tuple[int, int]] = set()
         self._keeper = Keeper()
         self._told_ns: int | None = None
         self._told: tuple[int, int, int] | None = None
-        self._counts = {"slam.scans": 0, "slam.scans_passed": 0, "slam.scans_unordered": 0, "slam.work_errors": 0}
+        self._counts = {
+            "slam.scans": 0,
+            "slam.scans_passed": 0,
+            "slam.scans_unordered": 0,
+            "slam.work_errors": 0,
+            "slam.closures_undone": 0,
+        }
         if stored is not None:
             self._resume(stored)
 
@@ -167,6 +176,7 @@ class SlamLocaliser:
         self._work, self._update, self._told, self._search, self._searched = None, None, None, None, None
         self._keeper, self._searches, self._hypotheses = Keeper(), 0, (IDENTITY, ())
         self._matched.clear()
+        self._asked_to_undo.clear()
         if self._redrawer is not None:
             self._redrawer.start_over(tiles)
         stored = stored_or_none(slam)
@@ -254,10 +264,13 @@ class SlamLocaliser:
         seen_odom = None if self._is_broken else odom
         self._take_update(self._slam.add_scan(scan, base_from_sensor, seen_odom, sensor=sensor), odom)
         self._is_broken = False
+        self._begin_work()
+        return True
+
+    def _begin_work(self) -> None:
         work = self._slam.take_work()
         if work is not None:
             self._work = self._submit(work.run)
-        return True
 
     def _take_update(self, update: SlamUpdate, odom: Pose2 | None) -> None:
         self._update, self._update_odom = update, odom or IDENTITY
@@ -346,11 +359,66 @@ class SlamLocaliser:
             log.exception("internal error while looking for loops; these key scans stay without")
             self._slam.abandon()
         self._work = None
+        self._undo_asked()
         last = self._slam.last_pose
         if last is not None:
             self._map_from_odom = last @ self._update_odom.inverse()
         if self._redrawer is not None and self._slam.epoch != epoch:
             self._redrawer.corrected(stamp_ns, self._slam.key_poses())
+
+    # --- undoing, on the fusion thread
+
+    def closures_told(self) -> Mapping[str, object]:
+        """The answer of `@rpc/list_closures`."""
+        return closure_fields(self._slam)
+
+    def undo(self, arguments: Mapping[str, Any]) -> Mapping[str, object]:
+        """The answer of `@rpc/undo_closure`: what is forgotten, at once or as soon as the work under way, which knows
+        it, has been taken up. The graph then settles as after any work, and the map is drawn again where it moved."""
+        chosen = _chosen(arguments, [*self._slam.closures, *self._slam.pending])
+        told = [
+            each
+            for name in ("closures", "on_probation")
+            for each in cast(list[dict[str, Any]], closure_fields(self._slam)[name])
+            if (each["from"], each["to"]) in chosen
+        ]
+        self._asked_to_undo |= chosen
+        if not self._slam.is_working:
+            self._undo_asked()
+        left = sum((each.start, each.to) not in chosen for each in self._slam.closures)
+        return {"undone": told, "closures": left, "epoch": self._slam.epoch}
+
+    def _undo_asked(self) -> None:
+        if self._asked_to_undo:
+            undone = self._slam.undo_between(self._asked_to_undo)
+            self._asked_to_undo.clear()
+            self._counts["slam.closures_undone"] += undone
+            if undone:
+                self._slam.settle()
+                self._begin_work()
+
+
+def _chosen(arguments: Mapping[str, Any], closures: Sequence[Closure]) -> set[tuple[int, int]]:
+    """Pairs of key scans whose closures are meant; CallRefused says what is wrong with the arguments."""
+    near = arguments.get("near", 0)
+    unknown = arguments.keys() - {"number", "first", "second", "near"}
+    by_number = set(arguments) - {"near"} == {"number"}
+    by_pair = set(arguments) - {"near"} == {"first", "second"}
+    values = [near, *(arguments[name] for name in arguments.keys() & {"number", "first", "second"})]
+    if unknown or by_number == by_pair or not all(type(value) is int and value >= 0 for value in values):
+        raise CallRefused('write {"number": 7}, or {"first": 12, "second": 180}; "near": 10 may be added')
+    if by_number:
+        meant = [c for c in closures if c.number == arguments["number"]]
+    else:
+        ends = {arguments["first"], arguments["second"]}
+        meant = [c for c in closures if {c.start, c.to} == ends]
+    if not meant:
+        raise CallRefused("there is no such closure; list_closures tells those there are")
+    return {
+        (c.start, c.to)
+        for c in closures
+        if any(abs(c.start - m.start) <= near and abs(c.to - m.to) <= near for m in meant)
+    }
 
 
 def stored_or_none(tiles: Iterable[StoredTile]) -> Stored | None:
@@ -366,7 +434,20 @@ def graph_fields(slam: Slam) -> dict[str, object]:
     """The document umfeld.graph.v1 but for its schema and stamp: where the robot came along, and which places it saw
     again. Metres and radians, rounded to a millimetre and a milliradian."""
     keys = [[round(float(v), 3) + 0.0 for v in pose] for pose in slam.key_poses()]
-    closures = [
+    return {"frame": "map", "epoch": slam.epoch, "keys": keys, "closures": _accepted(slam)}
+
+
+def closure_fields(slam: Slam) -> dict[str, object]:
+    """Closures as in graph_fields, each with how far its key scans stand from where it wants them; and those on
+    probation, which pull at nothing yet."""
+    poses = slam.snapshot().poses
+    accepted = [{**told, **_misfit(each, poses)} for told, each in zip(_accepted(slam), slam.closures)]
+    waiting = [{"from": c.start, "to": c.to, "votes": c.worth, **_misfit(c, poses)} for c in slam.pending]
+    return {"epoch": slam.epoch, "closures": accepted, "on_probation": waiting}
+
+
+def _accepted(slam: Slam) -> list[dict[str, object]]:
+    return [
         {
             "number": closure.number,
             "from": closure.start,
@@ -376,4 +457,10 @@ def graph_fields(slam: Slam) -> dict[str, object]:
         }
         for closure, weight in zip(slam.closures, slam.closure_weight)
     ]
-    return {"frame": "map", "epoch": slam.epoch, "keys": keys, "closures": closures}
+
+
+def _misfit(closure: Closure, poses: F64) -> dict[str, float]:
+    """poses: (K, 3) of the sensor at key scans."""
+    start, to = (Pose2(*poses[key].tolist()) for key in (closure.start, closure.to))
+    off = closure.measured.inverse() @ (start.inverse() @ to)
+    return {"off_m": round(math.hypot(off.x_m, off.y_m), 3), "off_deg": round(math.degrees(abs(off.yaw_rad)), 2)}

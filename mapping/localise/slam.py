@@ -25,8 +25,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -576,16 +576,19 @@ class Slam:
         """The piece of work that became ready with the last scan, once; None if there is none."""
         n = len(self._views)
         if self._outstanding is None and n - self._looked_at >= self.settings.work_keys:
-            self._outstanding = Work(self._snapshot(tuple(range(self._looked_at, n))), self.settings.closures)
+            self._hand_out(self._snapshot(tuple(range(self._looked_at, n))))
             self._looked_at = n
-            lag_s = self.settings.lag_s + self.settings.lag_s_per_key * n
-            assert self._last is not None
-            self._due_ns = self._last[0] + round(lag_s * 1e9)
-            self._handed_out = False
         if self._outstanding is None or self._handed_out:
             return None
         self._handed_out = True
         return self._outstanding
+
+    def _hand_out(self, snapshot: Snapshot) -> None:
+        self._outstanding = Work(snapshot, self.settings.closures)
+        lag_s = self.settings.lag_s + self.settings.lag_s_per_key * len(self._views)
+        assert self._last is not None
+        self._due_ns = self._last[0] + round(lag_s * 1e9)
+        self._handed_out = False
 
     def is_due(self, stamp_ns: int) -> bool:
         """Whether the result of the work that was taken must be applied before a scan of this stamp is added."""
@@ -711,12 +714,43 @@ class Slam:
         self.closure_weight = self.closure_weight[kept]
         self._unoptimised += 1
 
+    def undo_between(self, pairs: Collection[tuple[int, int]]) -> int:
+        """Forget every closure, accepted or on probation, that ties one of these pairs (start, to) of key scans; how
+        many were accepted. The map settles with `settle`, or at the next optimisation."""
+        if self._outstanding is not None:
+            raise WorkIsDueError("apply the result of the work that was taken first")
+        kept = [k for k, c in enumerate(self.closures) if (c.start, c.to) not in pairs]
+        undone = len(self.closures) - len(kept)
+        self.closures = tuple(self.closures[k] for k in kept)
+        self.closure_weight = self.closure_weight[kept]
+        self._pending = tuple(c for c in self._pending if (c.start, c.to) not in pairs)
+        self._unoptimised += undone
+        return undone
+
+    def settle(self) -> None:
+        """Make a piece of work that optimises the graph as it is, for `take_work`; WorkIsDueError if one is out."""
+        if self._outstanding is not None:
+            raise WorkIsDueError("apply the result of the work that was taken first")
+        if self._last is not None and len(self._views) > 1:
+            due = max(self._unoptimised, self.settings.closures.optimise_every)
+            self._hand_out(replace(self._snapshot(()), unoptimised=due))
+
     # --- what is known
 
     @property
     def keys(self) -> int:
         """Number of key scans."""
         return len(self._views)
+
+    @property
+    def pending(self) -> tuple[Closure, ...]:
+        """Closures on probation, in the order they were found."""
+        return self._pending
+
+    @property
+    def is_working(self) -> bool:
+        """Whether a piece of work is out whose result was not applied yet."""
+        return self._outstanding is not None
 
     @property
     def memory_bytes(self) -> int:

@@ -7,11 +7,11 @@ the walls of the grid against those of the world, poses against where the robot 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -311,6 +311,40 @@ def test_neither_path_nor_map_depends_on_when_results_come(most_asked: int) -> N
     assert made.held > 0
     assert path_of(made) == path_of(round_the_loop())
     assert digest_of(made.grid) == digest_of(round_the_loop().grid)
+
+
+def undoing(items: Sequence[tuple[str, Reading]], made: Robot, told: list[Mapping[str, Any]], after: float) -> Iterable[
+    tuple[str, Reading]
+]:  # fmt: skip
+    """All closures are undone by a call after a share of the readings."""
+    for index, item in enumerate(items):
+        if index == round(after * len(items)):
+            first = made.localiser.closures_told()["closures"]
+            assert isinstance(first, list)
+            told.append(made.localiser.undo({"number": first[0]["number"], "near": 10_000}))
+        yield item
+
+
+def test_closures_that_are_undone_let_the_map_go_and_it_is_drawn_again() -> None:
+    """Without its closures the loop does not meet itself, as odometry and matches alone leave it."""
+    driving, answers = drive("loop", 1.25), list[Mapping[str, Any]]()
+    made = robot(driving.truth(0))
+    made.play(undoing(driving.items, made, answers, 0.93))
+    told = answers[0]
+    whole = round_the_loop().localiser.slam
+    slam = made.localiser.slam
+    assert len(told["undone"]) > 3
+    assert told["closures"] == 0
+    assert made.fusion.counters()["slam.closures_undone"] == len(told["undone"])
+    gone = {(each["from"], each["to"]) for each in told["undone"]}
+    assert not gone & {(each.start, each.to) for each in slam.closures}
+    assert slam.epoch > told["epoch"]
+    assert made.fusion.counters()["map.redrawn"] > round_the_loop().fusion.counters()["map.redrawn"]
+    seen = made.subscriber
+    assert seen.patch is not None
+    assert seen.strays == 0
+    np.testing.assert_array_equal(seen.patch.cells, made.grid.patch(whole_tiles=True).cells)
+    assert len(slam.closures) < len(whole.closures)
 
 
 @pytest.mark.parametrize(("name", "laps", "seed"), [("office", 0.6, 0), ("warehouse", 1.1, 0), ("walkers", 0.6, 3)])

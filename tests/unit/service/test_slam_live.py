@@ -1,0 +1,145 @@
+"""Calls about closures: what they tell, what they forget, and when."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapping.frames import Pose2
+from mapping.scan import Scan
+from service.background import Submit, at_once
+from service.redraw import Redrawer
+from service.rpc import CallRefused
+from service.slam_live import SlamLocaliser
+
+F64 = NDArray[np.float64]
+
+MS = 1_000_000
+BEARING = np.linspace(-math.pi, math.pi, 241)[:-1]
+WALLS = np.array(  # a room of 6 m by 5 m with a niche and a pillar: x0, y0, x1, y1
+    [
+        [-3.0, -2.0, 3.0, -2.0], [3.0, -2.0, 3.0, 3.0], [3.0, 3.0, 1.0, 3.0], [1.0, 3.0, 1.0, 2.2],
+        [1.0, 2.2, -3.0, 2.2], [-3.0, 2.2, -3.0, -2.0], [-1.0, 1.2, -0.6, 1.2], [-0.6, 1.2, -0.6, 1.6],
+    ]
+)  # fmt: skip
+SURE = np.diag([1e4, 1e4, 1e5])
+
+
+def seen_from(pose: Pose2) -> F64:
+    """Exact ranges to the walls."""
+    ray = np.stack((np.cos(BEARING + pose.yaw_rad), np.sin(BEARING + pose.yaw_rad)), axis=-1)[:, None]
+    a, along = WALLS[None, :, :2] - (pose.x_m, pose.y_m), WALLS[None, :, 2:] - WALLS[None, :, :2]
+    cross = ray[..., 0] * along[..., 1] - ray[..., 1] * along[..., 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = (a[..., 0] * along[..., 1] - a[..., 1] * along[..., 0]) / cross
+        share = (a[..., 0] * ray[..., 1] - a[..., 1] * ray[..., 0]) / cross
+    return np.asarray(np.where((share >= 0.0) & (share <= 1.0) & (reach > 0.0), reach, np.inf).min(axis=1))
+
+
+class Driver:
+    """Drives a localiser along a line through the room, a scan each 0.2 s."""
+
+    def __init__(self, submit: Submit = at_once) -> None:
+        self.redrawer = Redrawer([], None, {"front": Pose2(0.0, 0.0, 0.0)}, submit=submit)
+        self.localiser = SlamLocaliser(["front"], submit=submit, redrawer=self.redrawer)
+        self.stamp_ns = 0
+
+    def drive(self, scans: int, step_m: float = 0.12) -> None:
+        for _ in range(scans):
+            self.stamp_ns += 200 * MS
+            x = -2.0 + step_m * self.stamp_ns / (200 * MS)
+            pose = Pose2(x, -0.5, 0.05 * math.sin(x))
+            self.localiser.take_scan("front", Scan(self.stamp_ns, 0.0, BEARING, seen_from(pose), 0.05, 20.0), None,
+                                     Pose2(0.0, 0.0, 0.0))  # fmt: skip
+
+
+@pytest.fixture
+def driver() -> Driver:
+    """Some key scans, too few for a piece of work, and three false closures."""
+    made = Driver()
+    made.drive(20)
+    slam = made.localiser.slam
+    assert 5 < slam.keys < 10
+    for start, to in ((0, 4), (1, 5), (0, 2)):
+        slam.add_closure(start, to, Pose2(1.0, 0.5, 0.2), SURE)
+    return made
+
+
+def test_closures_are_listed_with_how_far_off_they_are(driver: Driver) -> None:
+    told: Any = driver.localiser.closures_told()
+    assert [(each["from"], each["to"]) for each in told["closures"]] == [(0, 4), (1, 5), (0, 2)]
+    slam = driver.localiser.slam
+    poses = [Pose2(*row.tolist()) for row in slam.key_poses()]
+    apart = (poses[0].inverse() @ poses[4]) if poses else Pose2(0.0, 0.0, 0.0)
+    off = Pose2(1.0, 0.5, 0.2).inverse() @ apart
+    assert told["closures"][0]["off_m"] == pytest.approx(math.hypot(off.x_m, off.y_m), abs=1e-3)
+    assert told["closures"][0]["off_deg"] == pytest.approx(math.degrees(abs(off.yaw_rad)), abs=0.01)
+    assert told["on_probation"] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "gone"),
+    [
+        ({"number": 1}, {(1, 5)}),
+        ({"first": 4, "second": 0}, {(0, 4)}),
+        ({"number": 0, "near": 1}, {(0, 4), (1, 5)}),
+        ({"first": 0, "second": 4, "near": 2}, {(0, 4), (1, 5), (0, 2)}),
+    ],
+)
+def test_what_is_undone_is_told_and_gone(driver: Driver, arguments: dict[str, Any], gone: set[tuple[int, int]]) -> None:
+    told: Any = driver.localiser.undo(arguments)
+    assert {(each["from"], each["to"]) for each in told["undone"]} == gone
+    left = {(each.start, each.to) for each in driver.localiser.slam.closures}
+    assert left == {(0, 4), (1, 5), (0, 2)} - gone
+    assert told["closures"] == len(left)
+    assert driver.localiser.counters()["slam.closures_undone"] == len(gone)
+
+
+def test_the_graph_settles_before_a_scan_that_stamps_alone_decide(driver: Driver) -> None:
+    slam = driver.localiser.slam
+    before = slam.key_poses()
+    driver.localiser.undo({"number": 0, "near": 100})
+    assert slam.is_working
+    driver.drive(4)  # 0.8 s: the lag is longer
+    assert slam.is_working
+    driver.drive(2)
+    np.testing.assert_allclose(slam.key_poses()[: len(before)], before, atol=1e-6)  # what the path alone says
+
+
+def test_while_work_is_under_way_it_is_undone_afterwards(driver: Driver) -> None:
+    slam = driver.localiser.slam
+    while not slam.is_working:
+        driver.drive(1)
+    told: Any = driver.localiser.undo({"number": 0, "near": 100})
+    assert len(told["undone"]) == 3
+    assert told["closures"] == 0
+    assert len(slam.closures) == 3
+    driver.drive(6)
+    assert {(each.start, each.to) for each in slam.closures} & {(0, 4), (1, 5), (0, 2)} == set()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {},
+        {"first": 0},
+        {"number": 0, "first": 0, "second": 4},
+        {"number": "0"},
+        {"number": True},
+        {"number": -1},
+        {"number": 0, "near": 1.5},
+        {"number": 0, "all": 1},
+        {"number": 99},
+        {"first": 0, "second": 3},
+    ],
+)
+def test_what_names_no_closure_is_refused_in_words_and_changes_nothing(
+    driver: Driver, arguments: dict[str, Any]
+) -> None:
+    with pytest.raises(CallRefused, match=r"write|no such closure"):
+        driver.localiser.undo(arguments)
+    assert len(driver.localiser.slam.closures) == 3
