@@ -578,7 +578,9 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         from service.room_maker import RoomMaker
 
         rooms = config.rooms
-        makers.append(RoomMaker(period_ns=round(rooms.period_s * 1e9), clearance_m=rooms.clearance_m))
+        across_m = [corner[1] for corner in config.robot.footprint_m]
+        width_m = max(across_m) - min(across_m)
+        makers.append(RoomMaker(period_ns=round(rooms.period_s * 1e9), clearance_m=rooms.clearance_m, width_m=width_m))
     return makers
 
 

@@ -278,7 +278,15 @@ class Daemon:
         return self._makers.ask(partial(maker.route, arguments))
 
     def _on_plan(self, maker: RoomMaker, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        return self._makers.ask(partial(maker.plan, arguments))
+        """Plan, and tell everybody the way."""
+
+        def work() -> Mapping[str, Any]:
+            answer = maker.plan(arguments)
+            if (told := maker.planned()) is not None:
+                self._publisher.offer(told)
+            return answer
+
+        return self._makers.ask(work)
 
     def _on_name_room(self, maker: RoomMaker, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Name a room, and tell everybody at once."""

@@ -1,6 +1,8 @@
 """Rooms in the daemon: the grid in, the document of `map/rooms` out; ways over the Voronoi diagram, names (S44).
 
-What is not known to be free is an obstacle, for rooms and for ways. Ids and names are kept in the store.
+What is not known to be free is an obstacle, for rooms and for ways. A room is what the robot can come to through
+openings wide enough for it; it gets an id when the robot is in it, or when it was there in three turns running. Ids and
+names are kept in the store.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
@@ -21,7 +24,7 @@ from service.outputs import DocumentOut, Output
 from service.rpc import CallRefused
 
 if TYPE_CHECKING:
-    from mapping.hybrid.planner import Planner, Way
+    from mapping.hybrid.planner import Plan, Planner, Way
     from mapping.hybrid.room_book import RoomBook
     from mapping.hybrid.rooms import Room, RoomMap
     from mapping.hybrid.voronoi import VoronoiGrid
@@ -30,33 +33,55 @@ Bools = NDArray[np.bool_]
 F64 = NDArray[np.float64]
 
 KEY = "map/rooms"
+PLAN_KEY = "map/plan"
 FREE_BELOW = 35  # per cent; what is between free and occupied is not free
 _OUTLINE_M = 0.1
 _NAME_MAX = 64
 _ALTERNATIVES_MAX = 5
 _NAMES_ROW = 0  # ids begin at 1
+_SETTLE_TURNS = 3
+_AS_GOOD = 0.8  # of the widest place's clearance: then the middle of a room stays where it was
+
+
+@dataclass(frozen=True, slots=True)
+class _End:
+    """of a way: x, y.  told: what the caller said.  cells: those of the room, if it is one."""
+
+    at: tuple[float, float]
+    told: object
+    cells: Bools | None
 
 
 class RoomMaker:
     """A map maker: rooms and doors of the newest grid, with ids and names that stay."""
 
-    def __init__(self, *, period_ns: int = 5_000_000_000, clearance_m: float = 0.3) -> None:
-        """clearance_m: what a plan keeps if it is not told."""
+    def __init__(
+        self,
+        *,
+        period_ns: int = 5_000_000_000,
+        clearance_m: float = 0.3,
+        width_m: float = 0.4,
+        settle_turns: int = _SETTLE_TURNS,
+    ) -> None:
+        """clearance_m: what plans keep if not told.  width_m: of the robot.  settle_turns: RoomBook's settle."""
         from mapping.hybrid.room_book import RoomBook
 
         self.name = "rooms"
         self.sources: frozenset[str] = frozenset()
         self.period_ns = period_ns
-        self._clearance_m = clearance_m
-        self._book: RoomBook = RoomBook()
+        self._clearance_m, self._width_m, self._settle_turns = clearance_m, width_m, settle_turns
+        self._book: RoomBook = RoomBook(settle=settle_turns)
         self._names_changed = False
         self._grid: GridPatch | None = None
         self._found: RoomMap | None = None
         self._ids: dict[int, int] = {}
+        self._middles: dict[int, tuple[int, int]] = {}
+        """By id: the cell [row, col] of the map where the room is widest."""
         self._diagram: VoronoiGrid | None = None
         self._planner: Planner | None = None
         self._here: Pose2 | None = None
         self._told = b""
+        self._planned: dict[str, Any] | None = None
         self._version = 0
         self._stamp_ns = 0
 
@@ -70,25 +95,101 @@ class RoomMaker:
             return []
         from mapping.hybrid.rooms import find_rooms
 
-        patch = view.grid
-        free = _free(patch)
-        self._grid = GridPatch(patch.resolution_m, patch.row0, patch.col0, patch.cells.copy())
-        self._planner = None
-        self._found = find_rooms(free, patch.resolution_m)
-        self._ids = self._book.update(self._found, row0=patch.row0, col0=patch.col0)
+        patch = self._grid = _free_part(view.grid)
+        free, d = _free(patch), patch.resolution_m
+        shape, here = free.shape, self._cell_of(None if self._here is None else (self._here.x_m, self._here.y_m))
+        inside = self._book.territory_mask(shape, patch.row0, patch.col0)
+        if here is not None:
+            _mark_disc(inside, here, 0.5 * self._width_m / d)
+        self._found = find_rooms(free, d, width_m=self._width_m, inside=inside)
+        entered = None if here is None else int(self._found.labels[here])
+        self._ids = self._book.update(self._found, row0=patch.row0, col0=patch.col0, entered=entered)
+        self._draw_diagram(free)
+        self._find_middles()
         return self.news()
+
+    def _draw_diagram(self, free: Bools) -> None:
+        """And the planner on it, so that a call need not wait for them."""
+        from mapping.hybrid.planner import Planner
+        from mapping.hybrid.voronoi import VoronoiGrid
+
+        assert self._grid is not None
+        padded = np.pad(free, 1)  # so that the map's own border may be used
+        if self._diagram is not None and self._diagram.shape == padded.shape:
+            self._diagram.update(padded)
+        else:
+            self._diagram = VoronoiGrid(padded)
+        self._planner = Planner(
+            self._diagram, self._grid.resolution_m, row0=self._grid.row0 - 1, col0=self._grid.col0 - 1
+        )
+
+    def _find_middles(self) -> None:
+        """Where each room is widest, furniture and all; as long as it is about as wide there, where it was."""
+        from mapping.kernels.rooms import widest_cells
+
+        assert self._found is not None
+        assert self._grid is not None
+        assert self._diagram is not None
+        labels, squared = self._found.labels, np.ascontiguousarray(self._diagram.field.squared[1:-1, 1:-1])
+        widest = np.zeros(len(self._found.rooms) + 1, dtype=np.int64)
+        widest_cells(labels, squared, widest)
+        before, self._middles = self._middles, dict(self._middles)  # of those that sleep, too
+        for number, room_id in self._ids.items():
+            row, col = divmod(int(widest[number]), labels.shape[1])
+            kept = before.get(room_id)
+            if kept is not None:
+                old_row, old_col = kept[0] - self._grid.row0, kept[1] - self._grid.col0
+                is_in = 0 <= old_row < labels.shape[0] and 0 <= old_col < labels.shape[1]
+                is_in = is_in and labels[old_row, old_col] == number
+                if is_in and squared[old_row, old_col] >= _AS_GOOD**2 * squared[row, col]:
+                    row, col = old_row, old_col
+            self._middles[room_id] = (row + self._grid.row0, col + self._grid.col0)
 
     def news(self) -> list[Output]:
         """The document, if it says something new."""
         if self._found is None or self._grid is None:
             return []
-        fields = rooms_fields(self._found, self._ids, self._book.names, self._grid)
+        fields = self._fields()
         body = json.dumps(fields, sort_keys=True).encode()
         if body == self._told:
             return []
         self._told = body
         self._version += 1
         return [DocumentOut(KEY, self._stamp_ns, {"frame": "map", "version": self._version, **fields})]
+
+    def _fields(self) -> dict[str, Any]:
+        """The document umfeld.rooms.v1 but for its schema, stamp, frame and version. Metres, in the map frame."""
+        assert self._found is not None
+        assert self._grid is not None
+        assert self._diagram is not None
+        found, ids, grid = self._found, self._ids, self._grid
+        squared = self._diagram.field.squared[1:-1, 1:-1]
+        rooms = []
+        for room in sorted((r for r in found.rooms if r.number in ids), key=lambda r: ids[r.number]):
+            room_id = ids[room.number]
+            row, col = self._middles[room_id]
+            row, col = row - grid.row0, col - grid.col0
+            rooms.append(
+                {
+                    "id": room_id,
+                    "name": self._book.names.get(room_id),
+                    "position": _rounded(_middle((row, col), grid)),
+                    "clearance_m": round(math.sqrt(squared[row, col]) * grid.resolution_m, 3),
+                    "area_m2": round(room.area_m2, 2),
+                    "outline": outline_of(found, room, grid),
+                }
+            )
+        doors = [
+            {
+                "rooms": sorted((ids[door.a], ids[door.b])),
+                "position": _rounded(_middle(door.centre, grid)),
+                "ends": [_rounded(_middle(end, grid)) for end in door.ends],
+                "width_m": round(door.width_m, 3),
+            }
+            for door in found.doors
+            if door.a in ids and door.b in ids
+        ]
+        return {"rooms": rooms, "doors": doors}
 
     def changed_tiles(self) -> list[Tile]:
         """Territories of rooms, by id, and the names."""
@@ -105,7 +206,7 @@ class RoomMaker:
         from mapping.hybrid.room_book import RoomBook
 
         stored = {row: payload for row, _, payload in tiles}
-        book, head = RoomBook(), stored.pop(_NAMES_ROW, None)
+        book, head = RoomBook(settle=self._settle_turns), stored.pop(_NAMES_ROW, None)
         if head is not None:
             try:
                 told = json.loads(head)
@@ -115,6 +216,7 @@ class RoomMaker:
                 raise ValueError(f"names of rooms are damaged: {error}") from error
             book.restore({k: payload for k, payload in stored.items() if payload}, names, next_id)
         self._book, self._told, self._found, self._planner = book, b"", None, None
+        self._ids, self._middles = {}, {}
 
     # --- calls, between two turns of the makers' thread
 
@@ -143,7 +245,8 @@ class RoomMaker:
         "alternatives".
 
         An end is a position [x, y], a room's id or its name. Answers poses, length_m, clearance_m along them,
-        least_clearance_m, rooms (ids, in the order they are passed) and alternatives. CallRefused says why not.
+        least_clearance_m, rooms (ids, in the order they are passed) and alternatives. Where the robot stands with less
+        clearance than asked, the way begins with a step to where it has it. CallRefused says why not.
         """
         from mapping.hybrid.planner import NoWayError
 
@@ -158,61 +261,175 @@ class RoomMaker:
         count = arguments.get("alternatives", 2)
         if not isinstance(count, int) or isinstance(count, bool) or not 0 <= count <= _ALTERNATIVES_MAX:
             raise CallRefused(f'"alternatives" is a whole number up to {_ALTERNATIVES_MAX}, got {json.dumps(count)}')
-        if self._grid is None:
+        if self._planner is None:
             raise CallRefused("no grid is known yet: let the robot see some free space first")
         start, goal = self._place(arguments.get("start"), "start"), self._place(arguments.get("goal"), "goal")
+        stands_at = start.at
+        if start.told is None:
+            start = _End(self._out_of_a_tight_place(start.at, float(clearance_m)), None, None)
         try:
-            plan = self._warm_planner().plan(start, goal, clearance_m=float(clearance_m), alternatives=count)
+            plan = self._plan(start, goal, float(clearance_m), count)
         except NoWayError as error:
             raise CallRefused(str(error)) from error
-        return {**self._way(plan.way), "alternatives": [self._way(other) for other in plan.alternatives]}
+        ways = [self._way(way, stands_at if start.at != stands_at else None) for way in (plan.way, *plan.alternatives)]
+        answer = {**ways[0], "alternatives": ways[1:]}
+        self._planned = {"frame": "map", "start": start.told, "goal": goal.told, **answer}
+        return answer
 
-    def _warm_planner(self) -> Planner:
-        """On the newest grid; made when it is first asked for after a change."""
-        from mapping.hybrid.planner import Planner
-        from mapping.hybrid.voronoi import VoronoiGrid
+    def _out_of_a_tight_place(self, at: tuple[float, float], clearance_m: float) -> tuple[float, float]:
+        """Where the robot stands, or, with less clearance than asked, the nearest place that has it, straight on over
+        free cells and no farther than a robot's width and the clearance."""
+        from mapping.hybrid.planner import HALF_CELLS
+        from mapping.kernels.paths import sees
+
+        cell = self._cell_of(at)
+        if cell is None:
+            return at
+        assert self._grid is not None
+        assert self._diagram is not None
+        squared, d = self._diagram.field.squared, self._grid.resolution_m
+        row, col = cell[0] + 1, cell[1] + 1  # the diagram has a cell more around it
+        need, reach = (clearance_m / d + HALF_CELLS) ** 2, round((self._width_m + clearance_m) / d)
+        if squared[row, col] == 0 or squared[row, col] >= need:
+            return at
+        top, left = max(row - reach, 0), max(col - reach, 0)
+        rows, cols = np.nonzero(squared[top : row + reach + 1, left : col + reach + 1] >= need)
+        from_row, from_col = at[1] / d - self._grid.row0 + 0.5, at[0] / d - self._grid.col0 + 0.5
+        away = (rows + top - row) ** 2 + (cols + left - col) ** 2
+        for k in np.argsort(away, kind="stable").tolist():
+            to = int(rows[k]) + top, int(cols[k]) + left
+            if away[k] <= reach * reach and sees(squared, 1.0, from_row, from_col, float(to[0]), float(to[1])):
+                return _middle((to[0] - 1, to[1] - 1), self._grid)
+        return at
+
+    def planned(self) -> Output | None:
+        """The newest plan as a document, once."""
+        fields, self._planned = self._planned, None
+        return None if fields is None else DocumentOut(PLAN_KEY, self._stamp_ns, fields)
+
+    def _plan(self, start: _End, goal: _End, clearance_m: float, alternatives: int) -> Plan:
+        """From the middle of a room to that of another; where it cannot be come to, from or to the widest place that
+        can. NoWayError."""
+        from mapping.hybrid.planner import NoWayError
+
+        assert self._planner is not None
+        try:
+            return self._planner.plan(start.at, goal.at, clearance_m=clearance_m, alternatives=alternatives)
+        except NoWayError:
+            at = self._joined(start, goal, clearance_m)
+            if at is None:
+                raise
+            return self._planner.plan(*at, clearance_m=clearance_m, alternatives=alternatives)
+
+    def _joined(
+        self, start: _End, goal: _End, clearance_m: float
+    ) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """The ends, moved within their rooms to the widest places that are joined; None if nothing can be gained."""
+        from mapping.hybrid.planner import HALF_CELLS
+        from mapping.kernels.rooms import connected
 
         assert self._grid is not None
-        if self._planner is None:
-            free = _free(self._grid)
-            padded = np.pad(free, 1)  # so that the map's own border may be used
-            if self._diagram is not None and self._diagram.shape == padded.shape:
-                self._diagram.update(padded)
+        assert self._diagram is not None
+        if start.cells is None and goal.cells is None:
+            return None
+        squared = np.ascontiguousarray(self._diagram.field.squared[1:-1, 1:-1])
+        wide = squared >= (clearance_m / self._grid.resolution_m + HALF_CELLS) ** 2
+        label = np.empty(wide.shape, dtype=np.int32)
+        connected(wide, True, label)
+        labels = [self._labels_in(end, label) for end in (start, goal)]
+        common = labels[0][np.isin(labels[0], labels[1])]
+        if not common.size:
+            return None
+        rated = np.where(label == common[0], squared, 0)
+        moved = []
+        for end in (start, goal):
+            if end.cells is None:
+                moved.append(end.at)
             else:
-                self._diagram = VoronoiGrid(padded)
-            self._planner = Planner(
-                self._diagram, self._grid.resolution_m, row0=self._grid.row0 - 1, col0=self._grid.col0 - 1
-            )
-        return self._planner
+                row, col = divmod(int(np.where(end.cells, rated, 0).argmax()), wide.shape[1])
+                moved.append(_middle((row, col), self._grid))
+        return moved[0], moved[1]
 
-    def _place(self, given: object, what: str) -> tuple[float, float]:
+    def _labels_in(self, end: _End, label: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Connected pieces of space that an end has a part in, the one it shares most with first."""
+        if end.cells is not None:
+            counts = np.bincount(label[end.cells & (label >= 0)])
+            order = np.argsort(-counts, kind="stable")
+            return order[counts[order] > 0].astype(np.int32)
+        cell = self._cell_of(end.at)
+        return np.array([] if cell is None or label[cell] < 0 else [label[cell]], dtype=np.int32)
+
+    def _cell_of(self, place: tuple[float, float] | None) -> tuple[int, int] | None:
+        """Row and column in the part of the grid that is looked at; None beyond it."""
+        if place is None or self._grid is None:
+            return None
+        row = math.floor(place[1] / self._grid.resolution_m) - self._grid.row0
+        col = math.floor(place[0] / self._grid.resolution_m) - self._grid.col0
+        rows, cols = self._grid.cells.shape
+        return (row, col) if 0 <= row < rows and 0 <= col < cols else None
+
+    def _place(self, given: object, what: str) -> _End:
         if given is None and what == "start":
             if self._here is None:
                 raise CallRefused('"start": where the robot is is not known; give a position [x, y] or a room')
-            return self._here.x_m, self._here.y_m
+            return _End((self._here.x_m, self._here.y_m), None, None)
         match given:
             case [x, y] if _is_number(x) and _is_number(y):
-                return float(x), float(y)
+                return _End((float(x), float(y)), [float(x), float(y)], None)
             case int() | str() if not isinstance(given, bool):
-                return self._anchor(given, what)
+                return self._room(given, what)
         raise CallRefused(f'"{what}" is a position [x, y], the id of a room or its name, got {json.dumps(given)}')
 
-    def _anchor(self, given: int | str, what: str) -> tuple[float, float]:
-        """The middle of a room: where it is widest."""
-        if self._found is not None and self._grid is not None:
-            for room in self._found.rooms:
-                if given in (self._ids[room.number], self._book.names.get(self._ids[room.number])):
-                    return _middle(room.anchor, self._grid)
-        raise CallRefused(f'"{what}": no room {json.dumps(given)} is there now; map/rooms tells which there are')
+    def _room(self, given: int | str, what: str) -> _End:
+        """A room by id or name; one that another has swallowed for now is where it was."""
+        assert self._grid is not None
+        name = given.strip() if isinstance(given, str) else None
+        room_id = given if isinstance(given, int) else next((k for k, v in self._book.names.items() if v == name), None)
+        if room_id not in self._book.known_ids:
+            raise CallRefused(f'"{what}": no room {json.dumps(given)} is known; map/rooms tells which there are')
+        number = next((n for n, k in self._ids.items() if k == room_id), None)
+        if self._found is not None and number is not None:
+            cells = self._found.labels == number
+        else:
+            cells = self._book.territory_mask(self._grid.cells.shape, self._grid.row0, self._grid.col0, only=room_id)
+            cells &= _free(self._grid)
+        if room_id not in self._middles:
+            if not cells.any():
+                raise CallRefused(f'"{what}": nothing of room {json.dumps(given)} is free now')
+            row, col = np.argwhere(cells)[0].tolist()
+            return _End(_middle((row, col), self._grid), given, cells)
+        row, col = self._middles[room_id]
+        return _End(_middle((row - self._grid.row0, col - self._grid.col0), self._grid), given, cells)
 
-    def _way(self, way: Way) -> dict[str, Any]:
-        return {
+    def _way(self, way: Way, stands_at: tuple[float, float] | None) -> dict[str, Any]:
+        """stands_at: whence the robot comes first, with less clearance than the way has."""
+        fields: dict[str, Any] = {
             "poses": [_rounded(pose) for pose in way.poses],
             "length_m": round(way.length_m, 3),
             "clearance_m": _rounded(way.clearance_m),
             "least_clearance_m": round(way.least_clearance_m, 3),
             "rooms": self._rooms_along(way),
         }
+        if stands_at is not None:
+            step = way.poses[0, :2] - stands_at
+            least_m = self._clearance_between(stands_at, (float(way.poses[0, 0]), float(way.poses[0, 1])))
+            fields["poses"].insert(0, _rounded((*stands_at, math.atan2(step[1], step[0]))))
+            fields["clearance_m"].insert(0, round(least_m, 3))
+            fields["length_m"] = round(way.length_m + math.hypot(*step), 3)
+            fields["least_clearance_m"] = round(min(least_m, way.least_clearance_m), 3)
+        return fields
+
+    def _clearance_between(self, a: tuple[float, float], b: tuple[float, float]) -> float:
+        """The least on a straight line."""
+        from mapping.hybrid.planner import HALF_CELLS
+        from mapping.kernels.paths import least_along
+
+        assert self._grid is not None
+        assert self._diagram is not None
+        d = self._grid.resolution_m
+        corners = np.array((a, b))[:, ::-1] / d - (self._grid.row0 - 1, self._grid.col0 - 1) - 0.5
+        least = math.sqrt(least_along(self._diagram.field.squared, np.ascontiguousarray(corners), 2))
+        return max(least - HALF_CELLS, 0.0) * d
 
     def _rooms_along(self, way: Way) -> list[int]:
         assert self._grid is not None
@@ -222,36 +439,9 @@ class RoomMaker:
         cells = np.clip(cells - (self._grid.row0, self._grid.col0), 0, np.array(self._found.labels.shape) - 1)
         passed: list[int] = []
         for number in self._found.labels[cells[:, 0], cells[:, 1]].tolist():
-            if number > 0 and passed[-1:] != [self._ids[number]]:
+            if number in self._ids and passed[-1:] != [self._ids[number]]:
                 passed.append(self._ids[number])
         return passed
-
-
-def rooms_fields(found: RoomMap, ids: Mapping[int, int], names: Mapping[int, str], grid: GridPatch) -> dict[str, Any]:
-    """The document umfeld.rooms.v1 but for its schema, stamp, frame and version. Metres, in the map frame."""
-    rooms = sorted(found.rooms, key=lambda room: ids[room.number])
-    return {
-        "rooms": [
-            {
-                "id": ids[room.number],
-                "name": names.get(ids[room.number]),
-                "position": _rounded(_middle(room.anchor, grid)),
-                "clearance_m": round(room.clearance_m, 3),
-                "area_m2": round(room.area_m2, 2),
-                "outline": outline_of(found, room, grid),
-            }
-            for room in rooms
-        ],
-        "doors": [
-            {
-                "rooms": sorted((ids[door.a], ids[door.b])),
-                "position": _rounded(_middle(door.centre, grid)),
-                "ends": [_rounded(_middle(end, grid)) for end in door.ends],
-                "width_m": round(door.width_m, 3),
-            }
-            for door in found.doors
-        ],
-    }
 
 
 def outline_of(found: RoomMap, room: Room, grid: GridPatch) -> list[list[float]]:
@@ -274,6 +464,26 @@ def outline_of(found: RoomMap, room: Room, grid: GridPatch) -> list[list[float]]
 
 def _free(grid: GridPatch) -> Bools:
     return np.asarray((grid.cells >= 0) & (grid.cells < FREE_BELOW))
+
+
+def _free_part(grid: GridPatch) -> GridPatch:
+    """A copy of the part that holds all that is free, cut at multiples of 64 cells of the map or at the grid's end."""
+    free, (height, width) = _free(grid), grid.cells.shape
+    rows, cols = np.flatnonzero(free.any(axis=1)), np.flatnonzero(free.any(axis=0))
+    if not len(rows):
+        return GridPatch(grid.resolution_m, grid.row0, grid.col0, grid.cells[:1, :1].copy())
+    spans = []
+    for cells, first, size in ((rows, grid.row0, height), (cols, grid.col0, width)):
+        begin, end = int(cells[0]) + first - 1, int(cells[-1]) + first + 2
+        spans.append((max(begin // 64 * 64 - first, 0), min(-(-end // 64) * 64 - first, size)))
+    (top, bottom), (left, right) = spans
+    part = grid.cells[top:bottom, left:right].copy()
+    return GridPatch(grid.resolution_m, grid.row0 + top, grid.col0 + left, part)
+
+
+def _mark_disc(mask: Bools, at: tuple[int, int], radius: float) -> None:
+    rows, cols = np.ogrid[: mask.shape[0], : mask.shape[1]]
+    mask |= (rows - at[0]) ** 2 + (cols - at[1]) ** 2 <= radius * radius
 
 
 def _middle(cell: tuple[int, int], grid: GridPatch) -> tuple[float, float]:

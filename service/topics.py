@@ -22,6 +22,7 @@ JSON_PLANES = "application/json;umfeld.planes.v1"
 JSON_TOPO = "application/json;umfeld.topo.v1"
 JSON_LOCALISATION = "application/json;umfeld.localisation.v1"
 JSON_ROOMS = "application/json;umfeld.rooms.v1"
+JSON_PLAN = "application/json;umfeld.plan.v1"
 JSON_REPLY = "application/json;umfeld.reply.v1"
 
 _CHUNK = re.compile(r"[a-z0-9_-]+\Z")
@@ -292,6 +293,16 @@ MAP_ROOMS = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+MAP_PLAN = Topic(
+    "map/plan",
+    "umfeld.plan.v1",
+    JSON_PLAN,
+    "after each answered `@rpc/plan`",
+    "The way last planned, and its alternatives: what the caller was told.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 HEALTH = Topic(
     "health",
     DIAGNOSTICS,
@@ -353,6 +364,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_PLANES,
     MAP_TOPO,
     MAP_ROOMS,
+    MAP_PLAN,
     HEALTH,
     HEALTH_JSON,  # before health/<sensor>: the exact key wins
     HEALTH_ONE,

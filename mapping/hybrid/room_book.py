@@ -42,17 +42,21 @@ class RoomBook:
     ids of the same updates in the same order are the same.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, settle: int = 1) -> None:
+        """settle: in how many updates running a region must be found before it gets an id of its own."""
+        self._settle = settle
         self._known: dict[int, _Known] = {}
+        self._waiting: list[tuple[_Known, int]] = []
         self._next = 1
         self.names: dict[int, str] = {}
         self.changed: set[int] = set()
         """Ids whose territory changed since somebody emptied this."""
 
-    def update(self, found: RoomMap, *, row0: int = 0, col0: int = 0) -> dict[int, int]:
-        """Ids of the rooms of a new decomposition, by their number in it.
+    def update(self, found: RoomMap, *, row0: int = 0, col0: int = 0, entered: int | None = None) -> dict[int, int]:
+        """Ids of the rooms of a new decomposition, by their number in it; of regions that wait, none.
 
-        row0, col0: place of its first cell on the map. Each region gets one id, no id goes to two.
+        row0, col0: place of its first cell on the map.  entered: the room that the robot is in, which need not wait.
+        Each region gets one id at most, no id goes to two.
         """
         shared = {room_id: self._shared(known, found, row0, col0) for room_id, known in self._known.items()}
         sizes = np.bincount(found.labels.ravel(), minlength=len(found.rooms) + 1)
@@ -67,6 +71,7 @@ class RoomBook:
             if open_claims:
                 enough = _RIVALS * max(open_claims.values())
                 ids[number] = min(k for k, count in open_claims.items() if count >= enough)
+        waiting: list[tuple[_Known, int]] = []
         for room in found.rooms:
             if room.number in ids:
                 room_id = ids[room.number]
@@ -74,15 +79,39 @@ class RoomBook:
                 if any(shared[k][room.number] > _SWALLOWED * self._known[k].area for k in others):
                     continue  # more than this room is in it: what was known of it stands
             else:
+                seen = 1 + self._waited(found, room.number, int(sizes[room.number]), row0, col0)
+                if seen < self._settle and room.number != entered:
+                    waiting.append((_territory_of(found, room.number, row0, col0), seen))
+                    continue
                 room_id = ids[room.number] = self._next
                 self._next += 1
             self._learn(room_id, found, room.number, row0, col0)
+        self._waiting = waiting
         return ids
+
+    def _waited(self, found: RoomMap, number: int, size: int, row0: int, col0: int) -> int:
+        """In how many updates before this one running the region was found."""
+        shares = ((known, seen, int(self._shared(known, found, row0, col0)[number])) for known, seen in self._waiting)
+        return max((seen for known, seen, share in shares if share >= _SAME * min(known.area, size)), default=0)
+
+    def territory_mask(self, shape: tuple[int, int], row0: int, col0: int, *, only: int | None = None) -> Bools:
+        """(R, C) cells of a window that belong to a room (default: to any that there ever was)."""
+        mask = np.zeros(shape, dtype=np.bool_)
+        for known in self._known.values() if only is None else (self._known[only],):
+            top, left = known.row0 - row0, known.col0 - col0
+            rows = slice(max(top, 0), max(min(top + known.cells.shape[0], shape[0]), 0))
+            cols = slice(max(left, 0), max(min(left + known.cells.shape[1], shape[1]), 0))
+            if rows.start < rows.stop and cols.start < cols.stop:
+                mask[rows, cols] |= known.cells[
+                    rows.start - top : rows.stop - top, cols.start - left : cols.stop - left
+                ]
+        return mask
 
     def forget_all(self) -> None:
         """The map begins anew. Ids go on from where they were, so that none means two rooms."""
         self.changed |= set(self._known)
         self._known.clear()
+        self._waiting.clear()
         self.names.clear()
 
     @property
@@ -106,7 +135,7 @@ class RoomBook:
         known = {room_id: _territory(payload) for room_id, payload in territories.items()}
         if any(room_id < 1 for room_id in known) or next_id < 1 or not set(names) <= set(known):
             raise ValueError("ids of rooms do not fit together")
-        self._known, self.names = known, dict(names)
+        self._known, self.names, self._waiting = known, dict(names), []
         self._next = max([next_id, *(room_id + 1 for room_id in known)])
         self.changed = set()
 
@@ -121,14 +150,18 @@ class RoomBook:
         return np.bincount(found.labels[rows, cols][own], minlength=len(found.rooms) + 1)
 
     def _learn(self, room_id: int, found: RoomMap, number: int, row0: int, col0: int) -> None:
-        mask = found.labels == number
-        rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        cells = mask[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1].copy()
-        new = _Known(row0 + int(rows[0]), col0 + int(cols[0]), cells, int(cells.sum()))
+        new = _territory_of(found, number, row0, col0)
         old = self._known.get(room_id)
         if old is None or (old.row0, old.col0) != (new.row0, new.col0) or not np.array_equal(old.cells, new.cells):
             self._known[room_id] = new
             self.changed.add(room_id)
+
+
+def _territory_of(found: RoomMap, number: int, row0: int, col0: int) -> _Known:
+    mask = found.labels == number
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    cells = mask[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1].copy()
+    return _Known(row0 + int(rows[0]), col0 + int(cols[0]), cells, int(cells.sum()))
 
 
 def _territory(payload: bytes) -> _Known:

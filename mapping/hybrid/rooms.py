@@ -29,6 +29,7 @@ class RoomRules:
 
     clutter_m: obstacles that stand alone and are no longer or wider are furniture and belong to the room around them.
     room_min_m2: smaller pieces join the neighbour they are most open to; alone they are no room.
+    corner_m: how far beyond what a robot of the given width sweeps space belongs to the room: its corners.
     keep, slack_m: a narrowing to no less than keep of the clearance beyond it, less slack_m, is no cut at all.
 
     The other cuts are judged by a sum. It rises with the clearance in the passage, as a share of the mean clearance of
@@ -40,6 +41,7 @@ class RoomRules:
 
     clutter_m: float = 1.0
     room_min_m2: float = 2.5
+    corner_m: float = 0.3
     keep: float = 0.95
     slack_m: float = 0.0125
     narrow_weight: float = 0.4
@@ -88,19 +90,36 @@ class RoomMap:
     doors: tuple[Door, ...]
 
 
-def find_rooms(free: ArrayLike, resolution_m: float, rules: RoomRules | None = None) -> RoomMap:
+def find_rooms(
+    free: ArrayLike,
+    resolution_m: float,
+    rules: RoomRules | None = None,
+    *,
+    width_m: float = 0.0,
+    inside: Bools | None = None,
+) -> RoomMap:
     """Rooms and doors of a grid.
 
     free: (R, C), True where it was seen empty; all else, and what lies beyond the border, is an obstacle.
-    Time: some 60 ns a cell. The same cells give the same rooms in the same order.
-    Raises ValueError if free is not (R, C), has a side above 19,998, or resolution_m is no positive length.
+    width_m: of a robot: openings too narrow for it are no doors, and what lies behind them only is no room (in a grid
+    that a robot draws, most often a beam that went past a corner or into the void).
+    inside: (R, C), where it is or could come to once; None, or if none of it is wide enough: anywhere that it fits.
+    Time: some 60 ns a cell, twice that with a width. The same cells give the same rooms in the same order.
+    Raises ValueError if free is not (R, C), has a side above 19,998, inside another shape, or a length is none.
     """
     rules, d = rules or RoomRules(), check_resolution(resolution_m)
     given = np.asarray(free, dtype=np.bool_)
     if given.ndim != 2 or given.size == 0:
         raise ValueError(f"free cells are (R, C), got {given.shape}")
+    if not (math.isfinite(width_m) and width_m >= 0.0):
+        raise ValueError(f"width_m is a length, got {width_m}")
+    if inside is not None and inside.shape != given.shape:
+        raise ValueError(f"inside has the shape of the free cells, {given.shape}, got {inside.shape}")
     open_space = without_clutter(np.pad(given, 1), round(rules.clutter_m / d))
     field = DistanceField(~open_space)
+    if width_m > 0.0:
+        open_space = _enterable(field, width_m / d, rules.corner_m / d, None if inside is None else np.pad(inside, 1))
+        field = DistanceField(~open_space)
     basin = np.empty(open_space.shape, dtype=np.int32)
     order = kernels.widest_first(field.squared)
     count = kernels.flood(field.squared, order, rules.keep, rules.slack_m / d, basin)
@@ -109,7 +128,7 @@ def find_rooms(free: ArrayLike, resolution_m: float, rules: RoomRules | None = N
     pieces.join_unconvincing(rules)
     labels = _number_rooms(basin, pieces, rules.room_min_m2 / (d * d))
     rooms = _describe(labels, field.squared, order, d)
-    doors = find_doors(labels, field, d)
+    doors = tuple(door for door in find_doors(labels, field, d) if door.width_m - d >= width_m)
     return RoomMap(d, np.ascontiguousarray(labels[1:-1, 1:-1]), rooms, doors)
 
 
@@ -125,6 +144,29 @@ def without_clutter(free: Bools, side_cells: int) -> Bools:
     inside = (box[:, :2] > 0).all(axis=1) & (box[:, 2:] < np.array(free.shape) - 1).all(axis=1)
     small = inside & (np.maximum(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1]) < side_cells)
     return np.asarray(free | np.append(small, False)[label])
+
+
+def _enterable(field: DistanceField, width: float, corner: float, inside: Bools | None) -> Bools:
+    """Cells that a disc of that width sweeps on its ways from inside, and what is connected with them within corner.
+
+    A passage of n cells between two obstacles has a clearance of (n + 1) / 2. All lengths in cells.
+    """
+    need = 0.5 * (width + 1.0)
+    middle: Bools = field.squared >= need * need
+    label = np.empty(field.shape, dtype=np.int32)
+    count = int(kernels.connected(middle, True, label))
+    if inside is not None and (reached := np.unique(label[inside & middle])).size:
+        is_reached = np.zeros(count + 1, dtype=np.bool_)
+        is_reached[reached] = True
+        middle = is_reached[label]
+    if not middle.any():
+        return middle
+    near: Bools = (DistanceField(middle).squared <= (need + corner) ** 2) & ~field.obstacle
+    count = int(kernels.connected(near, False, label))
+    holds_middle = np.zeros(count + 1, dtype=np.bool_)
+    holds_middle[label[middle]] = True
+    holds_middle[-1] = False  # the label of what is not near
+    return np.asarray(holds_middle[label])
 
 
 @dataclass(slots=True)

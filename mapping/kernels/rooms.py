@@ -280,3 +280,18 @@ def rename(basin: Any, name: Any) -> None:
     for r in range(rows):
         for c in range(cols):
             basin[r, c] = name[basin[r, c]]
+
+
+@njit(cache=True, nogil=True)
+def widest_cells(label: Any, squared: Any, widest: Any) -> None:
+    """widest: (N,) int64 out: of each label below N its cell of greatest distance as row * C + col, first in reading
+    order; -1 if it has none."""
+    widest[:] = -1
+    rows, cols = label.shape
+    flat = squared.reshape(-1)
+    for r in range(rows):
+        for c in range(cols):
+            k = label[r, c]
+            i = r * cols + c
+            if 0 <= k < len(widest) and (widest[k] < 0 or squared[r, c] > flat[widest[k]]):
+                widest[k] = i

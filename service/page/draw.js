@@ -220,6 +220,30 @@ export function drawRooms(g2, camera, map) {
   for (const room of map.rooms) g2.fillText(room.name ?? `room ${room.id}`, ...camera.toScreen(...room.position));
 }
 
+// The way last planned, its goal as a ring; alternatives are faint and dashed.
+export function drawPlan(g2, camera, plan) {
+  g2.strokeStyle = colours.robot;
+  g2.lineJoin = "round";
+  const line = (poses) => {
+    g2.beginPath();
+    for (const [x, y] of poses) g2.lineTo(...camera.toScreen(x, y));
+    g2.stroke();
+  };
+  g2.globalAlpha = 0.5;
+  g2.lineWidth = 1.5;
+  g2.setLineDash([6, 5]);
+  for (const other of plan.alternatives) line(other.poses);
+  g2.setLineDash([]);
+  g2.globalAlpha = 0.9;
+  g2.lineWidth = 3;
+  line(plan.poses);
+  const [x, y] = plan.poses.at(-1);
+  g2.beginPath();
+  g2.arc(...camera.toScreen(x, y), 6, 0, 2 * Math.PI);
+  g2.stroke();
+  g2.globalAlpha = 1;
+}
+
 export function compose(a, b) {
   const c = Math.cos(a.yaw), s = Math.sin(a.yaw);
   return { x: a.x + c * b.x - s * b.y, y: a.y + s * b.x + c * b.y, yaw: a.yaw + b.yaw };

@@ -24,6 +24,7 @@ class Robot {
     this.graph = null;
     this.topo = null;
     this.rooms = null;
+    this.plan = null;
     this.seen = new Map(); // when a device's newest reading came here
   }
 
@@ -104,6 +105,7 @@ const HANDLERS = [
   [/^map\/graph$/, (robot, payload) => robot.setGraph(json(payload))],
   [/^map\/topo$/, (robot, payload) => { robot.topo = json(payload); }],
   [/^map\/rooms$/, (robot, payload) => { robot.rooms = json(payload); }],
+  [/^map\/plan$/, (robot, payload) => { robot.plan = json(payload); }],
   [/^health\/json$/, (robot, payload) => takeHealth(robot, json(payload))],
   [/^info$/, (robot, payload) => { robot.info = json(payload); }],
 ];
@@ -300,6 +302,7 @@ function drawMap(robot) {
     const [x, y, yaw] = robot.topo.robot ?? [];
     if (!robot.pose && yaw !== undefined) draw.drawRobot(g2, camera, { x, y, yaw }, robot.footprint);
   }
+  if (layers.rooms && robot.plan) draw.drawPlan(g2, camera, robot.plan);
   if (robot.pose) {
     if (layers.sonar) drawCones(g2, robot);
     if (layers.scan) drawScans(g2, robot);

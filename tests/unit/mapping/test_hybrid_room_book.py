@@ -118,3 +118,19 @@ def test_damaged_territories_are_refused(damage: bytes) -> None:
     with pytest.raises(ValueError, match="fit together"):
         book.restore({}, {4: "attic"}, 2)
     assert book.known_ids == []
+
+
+def test_a_region_gets_an_id_when_it_was_there_in_enough_updates_running() -> None:
+    free = np.zeros((60, 130), dtype=np.bool_)
+    free[5:55, 5:55] = True
+    both = free.copy()
+    both[5:55, 60:110] = True
+    one, two = find_rooms(free, CELL_M), find_rooms(both, CELL_M)
+    book = RoomBook(settle=3)
+    assert book.update(one, entered=1) == {1: 1}
+    assert [book.update(found) for found in (two, two, one, two, two)] == [{1: 1}] * 5  # it was away in between
+    assert book.update(two, row0=0) == {1: 1, 2: 2}
+    assert book.known_ids == [1, 2]
+    mask = book.territory_mask((60, 40), 0, 40)
+    np.testing.assert_array_equal(mask, two.labels[:, 40:80] > 0)
+    np.testing.assert_array_equal(book.territory_mask((60, 130), 0, 0, only=2), two.labels == 2)

@@ -20,6 +20,7 @@ from service.room_maker import RoomMaker
 from service.rpc import CallRefused
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs" / "schemas" / "rooms.v1.json").read_text())
+PLAN_SCHEMA = json.loads((Path(__file__).parents[3] / "docs" / "schemas" / "plan.v1.json").read_text())
 CELL_M = 0.1
 ROW0, COL0 = -30, 200
 
@@ -52,8 +53,13 @@ def at(row: int, col: int) -> list[float]:
     return [(col + COL0 + 0.5) * CELL_M, (row + ROW0 + 0.5) * CELL_M]
 
 
+def standing_at(row: int, col: int) -> Pose2:
+    x_m, y_m = at(row, col)
+    return Pose2(x_m, y_m, 0.0)
+
+
 def test_rooms_and_their_door_are_told_once() -> None:
-    maker = RoomMaker()
+    maker = RoomMaker(settle_turns=1)
     assert told(maker, None) is None
     document = told(maker, house())
     assert document is not None
@@ -73,7 +79,7 @@ def test_rooms_and_their_door_are_told_once() -> None:
 
 
 def test_a_plan_leads_through_the_door_by_position_id_or_name() -> None:
-    maker = RoomMaker(clearance_m=0.2)
+    maker = RoomMaker(clearance_m=0.2, settle_turns=1)
     with pytest.raises(CallRefused, match="no grid"):
         maker.plan({"goal": 2})
     x_m, y_m = at(10, 10)
@@ -92,8 +98,95 @@ def test_a_plan_leads_through_the_door_by_position_id_or_name() -> None:
         maker.plan({"start": at(10, 10), "goal": 2})
 
 
+def test_a_plan_is_published_once_and_a_refusal_is_not() -> None:
+    maker = RoomMaker(clearance_m=0.2, settle_turns=1)
+    told(maker, house())
+    answer = maker.plan({"start": at(10, 10), "goal": 2})
+    output = maker.planned()
+    assert isinstance(output, DocumentOut)
+    document = {"schema": "umfeld.plan.v1", "stamp": {"sec": 0, "nanosec": 7}, **output.fields}
+    jsonschema.validate(document, PLAN_SCHEMA)
+    assert document["goal"] == 2
+    assert document["poses"] == answer["poses"]
+    assert maker.planned() is None
+    with pytest.raises(CallRefused):
+        maker.plan({"start": at(10, 10), "goal": 3})
+    assert maker.planned() is None
+
+
+def test_a_room_is_gone_to_where_no_furniture_stands() -> None:
+    """Tables stand where both rooms are widest but for them."""
+    grid = house()
+    grid.cells[20:25, 20:25] = 0
+    for left in (25, 77):
+        grid.cells[26:34, left : left + 8] = 100
+    maker = RoomMaker(clearance_m=0.2, settle_turns=1)
+    document = told(maker, grid)
+    assert document is not None
+    assert len(document["rooms"]) == 2
+    for room in document["rooms"]:
+        col, row = (int(np.floor(v / CELL_M)) - first for v, first in zip(room["position"], (COL0, ROW0)))
+        assert grid.cells[row, col] == 0
+        answer = maker.plan({"start": at(10, 10), "goal": room["id"]})
+        assert answer["poses"][-1][:2] == room["position"]
+        assert answer["rooms"][-1] == room["id"]
+
+
+def test_a_robot_that_stands_close_to_a_wall_may_leave_it_but_others_keep_their_clearance() -> None:
+    maker = RoomMaker(clearance_m=0.3, settle_turns=1)
+    told(maker, house(), standing_at(6, 30))  # two cells from the wall's: 0.06 m
+    answer = maker.plan({"goal": 2})
+    assert answer["poses"][0][:2] == pytest.approx(at(6, 30), abs=0.001)
+    assert answer["least_clearance_m"] == answer["clearance_m"][0] == pytest.approx(0.2 - 0.1 * 2**0.5, abs=0.001)
+    assert min(answer["clearance_m"][1:]) >= 0.3
+    steps = np.diff(np.array(answer["poses"])[:, :2], axis=0)
+    assert answer["length_m"] == pytest.approx(np.hypot(*steps.T).sum(), abs=0.01)
+    with pytest.raises(CallRefused, match="clearance"):
+        maker.plan({"start": at(6, 30), "goal": 2})
+
+
+def test_a_name_stays_good_for_plans_while_its_room_is_swallowed() -> None:
+    maker = RoomMaker(clearance_m=0.2, settle_turns=1)
+    told(maker, house())
+    maker.name_room({"id": 2, "name": "kitchen"})
+    open_plan = house()
+    open_plan.cells[5:55, 54:56] = 0
+    document = told(maker, open_plan)
+    assert document is not None
+    assert [room["id"] for room in document["rooms"]] == [1]
+    answer = maker.plan({"start": at(10, 10), "goal": " kitchen"})
+    assert answer["poses"][-1][0] > at(0, 56)[0]
+
+
+def test_a_beam_through_a_crack_makes_no_room_and_a_closed_door_takes_none() -> None:
+    grid = house()
+    free = GridPatch(CELL_M, ROW0, COL0, np.full((160, 112), -1, dtype=np.int8))
+    free.cells[:60] = grid.cells
+    free.cells[55:60, 30:32] = 0  # through the wall
+    free.cells[60:150, 20:42] = 0  # 20 square metres of nothing
+    maker = RoomMaker(settle_turns=1)
+    document = told(maker, free, standing_at(10, 10))
+    assert document is not None
+    assert [room["id"] for room in document["rooms"]] == [1, 2]
+    assert [door["rooms"] for door in document["doors"]] == [[1, 2]]
+    free.cells[25:35, 54:56] = 100
+    document = told(maker, free, standing_at(10, 10))
+    assert document is not None
+    assert [room["id"] for room in document["rooms"]] == [1, 2]
+    assert document["doors"] == []
+
+
+def test_a_room_waits_for_its_id_unless_the_robot_is_in_it() -> None:
+    maker, pose = RoomMaker(), standing_at(10, 10)
+    ids = []
+    for _ in range(4):
+        document = told(maker, house(), pose)
+        ids.append(None if document is None else [room["id"] for room in document["rooms"]])
+    assert ids == [[1], None, [1, 2], None]
+
+
 def test_unknown_cells_are_not_planned_through() -> None:
-    maker, grid = RoomMaker(clearance_m=0.0), house()
+    maker, grid = RoomMaker(clearance_m=0.0, settle_turns=1), house()
     grid.cells[25:35, 54:56] = -1
     told(maker, grid)
     with pytest.raises(CallRefused, match="no way"):
@@ -105,7 +198,7 @@ def test_unknown_cells_are_not_planned_through() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"goal": 9}, "no room 9"),
+        ({"goal": 9}, "no room 9 is known"),
         ({"goal": True}, "position"),
         ({"goal": [1.0]}, "position"),
         ({"goal": [float("nan"), 0.0]}, "position"),
@@ -117,14 +210,14 @@ def test_unknown_cells_are_not_planned_through() -> None:
     ],
 )
 def test_bad_plans_are_refused_in_words(arguments: dict[str, object], words: str) -> None:
-    maker = RoomMaker()
+    maker = RoomMaker(settle_turns=1)
     told(maker, house())
     with pytest.raises(CallRefused, match=words):
         maker.plan({"start": at(10, 10), **arguments} if words != "where the robot is" else arguments)
 
 
 def test_names_are_told_kept_and_belong_to_one_room() -> None:
-    maker = RoomMaker()
+    maker = RoomMaker(settle_turns=1)
     told(maker, house())
     assert maker.name_room({"id": 1, "name": " Küche "}) == {"id": 1, "name": "Küche"}
     (news,) = maker.news()
@@ -137,7 +230,7 @@ def test_names_are_told_kept_and_belong_to_one_room() -> None:
             maker.name_room(arguments)
     tiles = maker.changed_tiles()
     assert maker.changed_tiles() == []
-    again = RoomMaker()
+    again = RoomMaker(settle_turns=1)
     again.restore(tiles)
     document = told(again, house())
     assert document is not None
