@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from drivers.logs import Log, PoseKind, read_log
 from mapping.localise.calibrate import NAMES, Calibration, RobotModel, WheelTicks, calibrate
 from mapping.localise.pose_graph import composed_poses
-from mapping.localise.relative_motions import WAY_M, RelativeMotions, relative_motions, spread_out
+from mapping.localise.relative_motions import RelativeMotions, relative_motions, spread_out, way_between
 from mapping.localise.umbmark import SIDE_M, square_end
 from service.errors import WrongUsage
 from service.slam_log import run_slam, scan_of
@@ -22,6 +22,7 @@ F64 = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 VIRTUAL_M_PER_TICK = 1e-5  # of wheels that are worked back from odometry
+SAMPLES = 100  # sweeps that tell how far the walls are
 NOT_OBSERVABLE = "not observable yet"
 
 
@@ -40,7 +41,7 @@ class LogCalibration:
 
 
 def calibrate_log(
-    path: Path, *, way_m: float = WAY_M, track_width_m: float | None = None, progress: Progress | None = None
+    path: Path, *, way_m: float | None = None, track_width_m: float | None = None, progress: Progress | None = None
 ) -> LogCalibration:
     """Run SLAM over a log to know which sweeps to compare, compare them without it, and fit.
 
@@ -62,6 +63,8 @@ def calibrate_log(
     run = run_slam(log, log.scans, progress=progress)
     mount = np.tile(np.array(log.robot_from_laser), (len(log.scans), 1))
     lasers = composed_poses(run.robot_poses, mount)
+    if way_m is None:
+        way_m = way_between([scan_of(log, scan) for scan in log.scans[:: max(1, len(log.scans) // SAMPLES)]])
     chosen = spread_out(lasers, way_m=way_m)
     motions = relative_motions([scan_of(log, log.scans[k]) for k in chosen], lasers[chosen])
     return LogCalibration(calibrate(ticks, motions, start), start, motions, log.ticks is not None)

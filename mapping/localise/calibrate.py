@@ -37,7 +37,9 @@ RELATIVE = slice(LEFT, X)  # whose deviations are shares of the value
 PRIOR = np.array([0.5, 0.5, 0.7, 2.0, 2.0, 2.0, 0.3])
 # A number is told if it is surer than this: shares, metres, radians, seconds.
 TOLD_BELOW = np.array([0.01, 0.01, 0.02, 0.02, 0.02, math.radians(1.0), 0.02])
-NUDGE = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-5, 0.01])  # to differentiate by; the time by more than ticks jitter
+NUDGE = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-5, 0.1])  # to differentiate by; the time by more than ticks jitter
+# What matches get wrong alike (drawn towards no motion by a fraction of a millimetre), which no drive averages out.
+ALIKE = np.array([3e-4, 3e-4, 3e-4, 3e-4, 3e-4, 3e-4, 1e-4])
 LEAST_MOTIONS = 20
 GATE = 16.3  # squared Mahalanobis distance that 1 in 1000 exceeds, 3 degrees of freedom
 # Motions that tell the time offset, at starts and stops, look like outliers until it is right: the gate closes slowly.
@@ -263,7 +265,8 @@ def _covariance(J: F64, residual: F64, scale2: float) -> F64:
         for a, b in zip(np.array_split(J, blocks), np.array_split(residual, blocks))
     ])  # fmt: skip
     spread = covariance @ (pulls.T @ pulls) @ covariance * (blocks / max(1, blocks - 7))
-    wider = np.sqrt(np.maximum(1.0, np.diag(spread) / np.diag(covariance)))
+    own = np.diag(covariance)
+    wider = np.sqrt((np.maximum(own, np.diag(spread)) + ALIKE**2) / own)
     return np.asarray(covariance * np.outer(wider, wider))
 
 

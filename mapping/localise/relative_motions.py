@@ -22,10 +22,12 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 WAY_M = 0.5
+FARTHEST_WAY_M = 2.0
+WAY_SHARE = 0.15  # of the typical distance of what is seen: so far two sweeps still see the same
 TURN_RAD = math.radians(30.0)
 FARTHEST_M = 30.0
 LEAST_POINTS = 30
-LEAST_SCORE = 0.3  # of all points, each worth what it is not off
+LEAST_SCORE = 0.15  # of all points, each worth what it is not off
 FLOOR_M = 0.001  # no match is surer than this: surfaces are rough, beams are quantised
 FLOOR_RAD = math.radians(0.02)
 UNHELD_M2 = 1.0  # variance that stands for "not held at all"
@@ -54,6 +56,14 @@ class RelativeMotions:
 
     def __len__(self) -> int:
         return len(self.start_s)
+
+
+def way_between(scans: Sequence[Scan]) -> float:
+    """How far apart sweeps are best compared, metres: far, as a match errs by the same however long its way is."""
+    seen = [scan.range_m[np.isfinite(scan.range_m) & (scan.range_m < FARTHEST_M)] for scan in scans]
+    readings = np.concatenate(seen) if seen else np.zeros(0)
+    typical = float(np.median(readings)) if len(readings) else 0.0
+    return min(FARTHEST_WAY_M, max(WAY_M, WAY_SHARE * typical))
 
 
 def spread_out(poses: F64, *, way_m: float = WAY_M, turn_rad: float = TURN_RAD) -> I64:

@@ -16,7 +16,10 @@ app = typer.Typer()
 def calibrate(
     log: Annotated[Path, typer.Argument(help="A recorded log with wheel ticks or odometry, and a laser; or .gz.")],
     *,
-    way_m: Annotated[float, typer.Option("--way", min=0.05, help="Compare sweeps so far apart, metres.")] = 0.5,
+    way_m: Annotated[
+        float | None,
+        typer.Option("--way", min=0.05, help="Compare sweeps so far apart, metres; else by what they see."),
+    ] = None,
     ticks_per_turn: Annotated[
         float | None, typer.Option(help="Ticks of a turn of each wheel, gear included: tells radii too.")
     ] = None,

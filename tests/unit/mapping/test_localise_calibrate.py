@@ -88,17 +88,17 @@ def test_a_laser_mounted_any_way_round(yaw_deg: float) -> None:
 
 
 def test_the_deviations_are_what_the_errors_scatter_by() -> None:
-    """Over 30 noisy drives: squared errors over variances average to one, in all seven, and no bias is left."""
+    """Over 20 noisy drives: squared errors over variances average to one, in all seven, and no bias is left."""
     normal = []
-    for seed in range(30):
-        found = calibrate(*drive(about(120, seed), noise_m=0.004, noise_rad=0.003, seed=seed), START)
+    for seed in range(20):
+        found = calibrate(*drive(about(100, seed), noise_m=0.004, noise_rad=0.003, seed=seed), START)
         unit = np.append(TRUE.row()[:3], np.ones(4))
         normal.append(errors(found) / (found.deviation / np.abs(unit)))
     table = np.array(normal)
     mean_square = np.mean(table**2, axis=0)
-    assert np.all(mean_square < 1.99)  # 30 squares of a normal number average to more than that once in 1000
+    assert np.all(mean_square < 2.27)  # 20 squares of a normal number average to more than that once in 1000
     assert np.all(mean_square > 0.3)  # the larger of two estimates is cautious, but not out of all proportion
-    assert np.all(np.abs(table.mean(axis=0)) < 3.5 / math.sqrt(30.0))
+    assert np.all(np.abs(table.mean(axis=0)) < 3.5 / math.sqrt(20.0))
 
 
 def test_slips_and_wrong_matches_are_left_out() -> None:
