@@ -188,7 +188,8 @@ def test_without_devices_it_waits_and_says_so_and_a_second_daemon_is_refused(rob
             check=False,
         )
         assert second.returncode == 1
-        assert len(second.stderr.splitlines()) == 1, second.stderr
+        told = [line for line in second.stderr.splitlines() if "compiling the kernels" not in line]
+        assert len(told) == 1, second.stderr
         assert names in second.stderr
     assert robot.stop(daemon) == 0, robot.log()
 

@@ -6,7 +6,7 @@ import math
 from itertools import pairwise
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
@@ -83,18 +83,19 @@ def test_parameters_follow_a_rigid_motion(size: tuple[float, float, float, float
     same_lines(moved.transformed(pose.inverse()), lines, 1e-9)
 
 
+@example((1.4480728249271149, 5.296875, 1.40625, 2.0625, 33))  # a wall of five beams, seen one way round only
 @settings(max_examples=60, deadline=None)
 @given(rooms)
 def test_mirrored_scans_have_mirrored_lines(size: tuple[float, float, float, float, int]) -> None:
-    """The other way round the same walls are found; ends may differ by the beam at a corner."""
+    """The other way round the same walls are found. Ends may differ by the beam at a corner, and so may what is left of
+    a wall of hardly more beams than a line needs."""
     ranges = room(size)
-    lines = extract_lines(TURN, ranges)
-    mirrored = extract_lines(-TURN, ranges)
-    assert len(lines) == len(mirrored)
-    a, d, _ = lines.parameters()
-    b, e, _ = mirrored.parameters()
-    for angle, distance in zip(a, d):
-        assert np.min(np.abs(np.exp(-1j * angle) - np.exp(1j * b)) + np.abs(distance - e)) < 0.05
+    found = extract_lines(TURN, ranges), extract_lines(-TURN, ranges)
+    for lines, others in (found, found[::-1]):
+        a, d, _ = lines.chosen(lines.count >= 2 * LineRules().min_points).parameters()
+        b, e, _ = others.parameters()
+        for angle, distance in zip(a, d):
+            assert np.min(np.abs(np.exp(-1j * angle) - np.exp(1j * b)) + np.abs(distance - e)) < 0.05
 
 
 @settings(max_examples=40, deadline=None)

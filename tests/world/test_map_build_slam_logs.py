@@ -33,6 +33,7 @@ def relations_of(name: str) -> Relations:
 
 @pytest.mark.data
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @needs_data
 @pytest.mark.parametrize(("name", "most_m", "most_deg"), [("intel", 0.022, 0.45), ("fr079", 0.043, 0.53)])
 def test_the_relation_error_is_as_small_as_promised(name: str, most_m: float, most_deg: float, tmp_path: Path) -> None:
