@@ -85,12 +85,14 @@ if TYPE_CHECKING:
     from drivers.mavlink_in import MavlinkConversation
     from mapping.planes.extract import PlaneRules
     from service.background import Submit
+    from service.elevation_maker import ElevationMaker
     from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
     from service.map_localiser import KnownMapLayer
     from service.map_makers import MapMaker, MapMakers
     from service.mavlink_out import MavlinkOut
     from service.redraw import OnRedrawn
     from service.rpc import Handler
+    from service.sector_ground import SectorGroundTeller
 
 
 @dataclass(frozen=True, slots=True)
@@ -550,6 +552,8 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         from service.plane_maker import PlaneMaker
 
         makers.append(PlaneMaker(_plane_rules(config), period_ns=round(config.planes.period_s * 1e9)))
+    if config.elevation.enabled and config.mounts:
+        makers.append(_elevation_maker(config))
     lasers = frozenset(name for name, sensor in found.items() if isinstance(sensor, Laser))
     if config.lines.enabled and (fed_by := lasers & _sources(config, config.lines.sources, found)):
         from mapping.lines.line_map import LineMap
@@ -581,7 +585,58 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         across_m = [corner[1] for corner in config.robot.footprint_m]
         width_m = max(across_m) - min(across_m)
         makers.append(RoomMaker(period_ns=round(rooms.period_s * 1e9), clearance_m=rooms.clearance_m, width_m=width_m))
+    if config.clearance.enabled and config.grid.enabled:
+        from service.clearance_maker import ClearanceMaker
+
+        wanted = config.clearance
+        makers.append(
+            ClearanceMaker(
+                reach_m=wanted.reach_m,
+                unknown_is_obstacle=wanted.unknown_is_obstacle,
+                period_ns=round(wanted.period_s * 1e9),
+            )
+        )
     return makers
+
+
+def _elevation_maker(config: Config) -> ElevationMaker:
+    from mapping.grids.height import GroundRules
+    from service.elevation_maker import ElevationMaker
+
+    wanted = config.elevation
+    rules = GroundRules(
+        slope_max_rad=math.radians(wanted.slope_max_deg),
+        step_max_m=wanted.step_max_m,
+        roughness_max_m=wanted.roughness_max_m,
+    )
+    return ElevationMaker(
+        resolution_m=wanted.resolution_m,
+        size_m=wanted.size_m,
+        height_max_m=wanted.height_max_m,
+        clouds=wanted.clouds,
+        rules=rules,
+        footprint=config.robot.footprint_m,
+        period_ns=round(wanted.period_s * 1e9),
+    )
+
+
+def sector_ground(config: Config, makers: Sequence[MapMaker]) -> SectorGroundTeller | None:
+    """What adds the ground to the sector maps; None without an elevation map."""
+    if not (config.elevation.enabled and config.mounts):
+        return None
+    from service.elevation_maker import ElevationMaker
+    from service.sector_ground import SectorGroundTeller
+
+    for maker in makers:
+        if isinstance(maker, ElevationMaker):
+            return SectorGroundTeller(
+                maker,
+                footprint=config.robot.footprint_m,
+                reach_m=config.elevation.sector_reach_m,
+                hidden_m=config.elevation.sector_hidden_m,
+                stale_ns=round(config.elevation.stale_s * 1e9),
+            )
+    return None
 
 
 def _plane_rules(config: Config) -> PlaneRules:
@@ -847,6 +902,14 @@ def warm_up(config: Config) -> None:
         from mapping.planes.warm_up import warm_up as warm_up_planes
 
         warm_up_planes()
+    if "elevation" in names:
+        from mapping.sectors.footprint import in_polygon
+
+        in_polygon(np.zeros((1, 2)), np.array(config.robot.footprint_m))
+    if "clearance" in names:
+        from mapping.grids.clearance import DistanceField
+
+        DistanceField(np.eye(3, dtype=np.bool_)).update([(0, 1), (0, 2)], [(0, 0), (1, 1)])
     if "scenes" in names:
         from mapping.features.warm_up import warm_up as warm_up_features
 

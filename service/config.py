@@ -36,6 +36,8 @@ from service.config_files import KeyPath, Layers, find_config, origin_of, read_l
 from service.config_maps import (
     Alignment,
     Artos,
+    ClearanceSettings,
+    ElevationSettings,
     Grid,
     LineMapSettings,
     LocalGrid,
@@ -72,6 +74,8 @@ class Config(Section):
     artos: Artos = Field(default=Artos(), description="The ARTOS two-step map.")
     lines: LineMapSettings = Field(default=LineMapSettings(), description="The map of walls as lines.")
     planes: PlaneMapSettings = Field(default=PlaneMapSettings(), description="Planes of tilting lasers.")
+    elevation: ElevationSettings = Field(default=ElevationSettings(), description="Heights of the ground around.")
+    clearance: ClearanceSettings = Field(default=ClearanceSettings(), description="Distances to obstacles.")
     topo: TopoMapSettings = Field(default=TopoMapSettings(), description="Regions of free space and ways between them.")
     scenes: SceneMapSettings = Field(default=SceneMapSettings(), description="Scenes to be recognised again.")
     rooms: RoomMapSettings = Field(default=RoomMapSettings(), description="Rooms, doors, plans.")

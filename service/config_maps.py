@@ -118,6 +118,44 @@ class PlaneMapSettings(Section):
     sigma_m: Positive | None = Field(default=None, description="Noise of ranges; default: taken from each cloud.")
 
 
+class ElevationSettings(Section):
+    """The ground as nodding and turning lasers see it: key map/elevation, and fields of polar sectors."""
+
+    enabled: bool = Field(default=True, description="Keep it, if there is a [mounts.NAME].")
+    period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two that are published.")
+    resolution_m: float = Field(default=0.1, ge=0.02, le=1.0, description="Edge of a cell.")
+    size_m: float = Field(default=10.0, gt=0, le=100, description="Edge of the square around the vehicle.")
+    height_max_m: Positive = Field(default=2.0, description="What lies higher above the wheels' level is passed under.")
+    clouds: int = Field(default=10, ge=1, le=100, description="How many of each mount's newest clouds count.")
+    slope_max_deg: float = Field(default=20.0, gt=0, lt=90, description="Steeper ground cannot be driven on.")
+    step_max_m: Positive = Field(default=0.08, description="Nor can higher steps.")
+    roughness_max_m: Positive = Field(default=0.03, description="Nor ground that is rougher: rms off its plane.")
+    sector_reach_m: float = Field(
+        default=1.0, gt=0, le=50, description="How far sectors look at the ground, beyond what is hidden."
+    )
+    sector_hidden_m: Positive | None = Field(
+        default=None,
+        description="Ground that the lasers never see: so far around a sector map's origin on the vehicle nothing is"
+        " asked. Default: its outline's farthest corner.",
+    )
+    stale_s: float = Field(default=5.0, gt=0, le=600, description="Without a cloud for so long the ground is unknown.")
+
+    @model_validator(mode="after")
+    def _not_too_many_cells(self) -> ElevationSettings:
+        if (self.size_m / self.resolution_m) ** 2 > 22500:
+            raise ValueError("more than 150 x 150 cells; take a larger resolution_m or a smaller size_m")
+        return self
+
+
+class ClearanceSettings(Section):
+    """How near the next obstacle of the grid is: key map/clearance. Needs [grid]."""
+
+    enabled: bool = Field(default=False, description="Keep it.")
+    period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two that are published.")
+    reach_m: float = Field(default=2.0, ge=0.1, le=50, description="Farther away the cost is 0.")
+    unknown_is_obstacle: bool = Field(default=False, description="Keep off what was never seen as well.")
+
+
 class TopoMapSettings(Section):
     """Regions of free space and the passages between them: key map/topo, call @rpc/route. Needs [grid]."""
 

@@ -147,6 +147,7 @@ class Daemon:
         starting()
         makers = assemble.map_makers(config, self._sensors)
         self._makers = MapMakers(makers, self._publisher.offer, now_ns=self._clock.now_ns)
+        self._ground = assemble.sector_ground(config, makers)
         for maker in makers:
             if isinstance(maker, TopoMaker):
                 self._publisher.calls.register("route", partial(self._on_route, maker))
@@ -347,6 +348,8 @@ class Daemon:
         return [trouble for trouble in troubles if trouble is not None]
 
     def _offer(self, output: Output) -> None:
+        if self._ground is not None:
+            output = self._ground.with_ground(output)
         self._publisher.offer(output)
         self._makers.take_output(output)
         if self._mavlink is not None:

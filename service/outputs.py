@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mapping.frames import IDENTITY, Pose2
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
+from mapping.sectors.ground import SectorGround
 from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot
 
 F64 = NDArray[np.float64]
@@ -44,10 +45,11 @@ class RangesOut:
 
 @dataclass(frozen=True, slots=True)
 class PolarOut:
-    """Key sectors/polar/<name>."""
+    """Key sectors/polar/<name>. ground: what the elevation map says about each sector; None where there is none."""
 
     name: str
     snapshot: PolarSnapshot
+    ground: SectorGround | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.grids.height import Ground
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
+from mapping.sectors.ground import SectorGround
 from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot, SectorState
 from service import cdr, topics
 from service.export import grid_origin
@@ -50,6 +52,7 @@ GRID_ATTACHMENT = struct.Struct("<QQ")
 
 _LEVELS = ("ok", "warning", "error", "stale")
 _STATES = {state.value: state.name.lower() for state in SectorState}
+_CAN_DRIVE = {Ground.TRAVERSABLE.value: "true", Ground.UNKNOWN.value: "null"}
 _NANOS = 1_000_000_000
 _LONGEST_SCAN_PERIOD_NS = 10 * _NANOS
 _UNEVEN = 0.25  # of the angle between beams: what still counts as evenly spaced
@@ -184,7 +187,10 @@ class Encoder:
         if known is None or known[0] != fingerprint:
             known = self._polar_heads[out.name] = (fingerprint, _polar_heads(snap.edges_rad))
         text = _document_head("polar", out.name, stamp_ns, self._frames.base, snap.base_from_sensor)
-        text += ",".join(_polar_sectors(snap, known[1])) + "]}"
+        sectors = _polar_sectors(snap, known[1])
+        if out.ground is not None:
+            sectors = _with_ground(sectors, out.ground)
+        text += ",".join(sectors) + "]}"
         return Message(topics.POLAR, f"sectors/polar/{out.name}", text.encode(), stamp_ns)
 
     def _rect(self, out: RectOut, offset_ns: int) -> Message:
@@ -567,6 +573,19 @@ def _polar_sectors(snap: PolarSnapshot, heads: Sequence[str]) -> list[str]:
             _texts(snap.clearance_m, "%.4f"),
             _ages(snap.age_ns),
             snap.source.tolist(),
+        )
+    ]
+
+
+def _with_ground(sectors: Sequence[str], ground: SectorGround) -> list[str]:
+    """Each sector with its ground; what is not known to be traversable is never said to be."""
+    return [
+        f'{sector[:-1]},"slope_rad":{slope},"traversable":{_CAN_DRIVE.get(stop, "false")},"traversable_m":{way}}}'
+        for sector, slope, stop, way in zip(
+            sectors,
+            _texts(ground.slope_rad, "%.4f"),
+            ground.stopped_by.tolist(),
+            _texts(ground.traversable_m, "%.3f"),
         )
     ]
 

@@ -21,6 +21,7 @@ JSON_GRAPH = "application/json;umfeld.graph.v1"
 JSON_PLANES = "application/json;umfeld.planes.v1"
 JSON_TOPO = "application/json;umfeld.topo.v1"
 JSON_LOCALISATION = "application/json;umfeld.localisation.v1"
+JSON_ELEVATION = "application/json;umfeld.elevation.v1"
 JSON_ROOMS = "application/json;umfeld.rooms.v1"
 JSON_PLAN = "application/json;umfeld.plan.v1"
 JSON_REPLY = "application/json;umfeld.reply.v1"
@@ -224,6 +225,16 @@ MAP_ARTOS = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+MAP_CLEARANCE = Topic(
+    "map/clearance",
+    GRID,
+    cdr(GRID),
+    "at most 1 Hz, on change",
+    "How near the next obstacle is, as a cost: 100 on it, evenly down to 0 at `reach_m`; if configured.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 MAP_LINES = Topic(
     "map/lines",
     "umfeld.lines.v1",
@@ -269,6 +280,16 @@ MAP_PLANES = Topic(
     JSON_PLANES,
     "at most 1 Hz, with each cloud",
     "Planes of the newest cloud of each mount: walls, floor, table tops, with their outlines.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
+MAP_ELEVATION = Topic(
+    "map/elevation",
+    "umfeld.elevation.v1",
+    JSON_ELEVATION,
+    "at most 1 Hz, with each cloud",
+    "Heights, slope, steps and roughness of the ground around the vehicle, and where it can be driven on.",
     Priority.DATA_LOW,
     cached=True,
     lane=Lane.MAP,
@@ -357,11 +378,13 @@ TOPICS: tuple[Topic, ...] = (
     MAP_GRID_UPDATE,
     MAP_LOCAL,
     MAP_ARTOS,
+    MAP_CLEARANCE,
     MAP_LINES,
     MAP_SCENES,
     MAP_GRAPH,
     LOCALISATION,
     MAP_PLANES,
+    MAP_ELEVATION,
     MAP_TOPO,
     MAP_ROOMS,
     MAP_PLAN,

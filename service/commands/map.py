@@ -151,6 +151,9 @@ def info(
 def export(
     out: Annotated[Path, typer.Argument(help="Where to; the ending says what: .yaml (with .pgm), .png, .npy, .json.")],
     *,
+    inflate_m: Annotated[
+        float, typer.Option("--inflate", min=0.0, help="Also occupied: all that comes so near, metres, to an obstacle.")
+    ] = 0.0,
     store: Store = None,
     connect: Connect = None,
     config: Config = None,
@@ -159,7 +162,7 @@ def export(
 ) -> None:
     """Write the grid as a file other programs read. PGM and YAML are the ROS map server's.
 
-    Example: umfeld map export kitchen.yaml --store kitchen.umfeld
+    Example: umfeld map export kitchen.yaml --store kitchen.umfeld --inflate 0.3
     """
     from service.export import save_grid
 
@@ -168,6 +171,8 @@ def export(
     else:
         with _client(connect, config) as client:
             image = _live_image(client, _base(client, robot))
+    if inflate_m > 0.0:
+        image = _inflated(image, inflate_m)
     receipts = [receipt.document() for receipt in save_grid(image, out)]
     if as_json:
         typer.echo(json.dumps({"files": receipts}, indent=2))
@@ -275,6 +280,16 @@ def _image(path: Path) -> MapImage:
         return load_pgm_yaml(path)
     with _open(path) as opened:
         return image_of(occupancy_patch(opened))
+
+
+def _inflated(image: MapImage, radius_m: float) -> MapImage:
+    """Where the middle of a round vehicle of that radius can be."""
+    from dataclasses import replace
+
+    from mapping.grids.clearance import inflated
+    from mapping.grids.patch import GridPatch
+
+    return replace(image, cells=inflated(GridPatch(image.resolution_m, 0, 0, image.cells), radius_m).cells)
 
 
 def _live_image(client: Client, base: str) -> MapImage:

@@ -1,4 +1,4 @@
-"""A laser on a nodding mount from its wires to a client: clouds on `cloud/mast`, planes in `map/planes`."""
+"""A laser on a nodding mount from its wires to a client: clouds on `cloud/mast`, planes in `map/planes`, the ground."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from service.cdr import decode_cloud
+from service.cdr import decode_cloud, decode_grid
 from service.zenoh_session import Client
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,7 +45,10 @@ def test_a_nodding_laser_shows_floor_and_walls(tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     overlay = tmp_path / "umfeld.d"
     overlay.mkdir()
-    (overlay / "test.toml").write_text(f'[network]\nlisten = ["{endpoint}"]\n[store]\nenabled = false\n')
+    (overlay / "test.toml").write_text(
+        f'[network]\nlisten = ["{endpoint}"]\n[store]\nenabled = false\n'
+        "[clearance]\nenabled = true\n[elevation]\nsector_hidden_m = 1.5\n"
+    )
     processes: list[subprocess.Popen[bytes]] = []
 
     def start(*arguments: str) -> None:
@@ -77,11 +80,28 @@ def test_a_nodding_laser_shows_floor_and_walls(tmp_path: Path) -> None:
                 "planes with the floor among them", lambda: each if floor_of(each := planes()) else None
             )
             cloud = decode_cloud(wait_for("a cloud", lambda: client.get(f"{BASE}/cloud/mast"))[0].payload)
+            found = wait_for("the ground", lambda: client.get(f"{BASE}/map/elevation"))
+            ground = json.loads(found[0].payload)
+            heard = client.subscribe(f"{BASE}/sectors/polar/laser", ring=1)
+
+            def sectors() -> Any:
+                sample = heard.try_recv()
+                found = [] if sample is None else json.loads(bytes(sample.payload))["sectors"]
+                return found if any(each["traversable_m"] > 0.0 for each in found) else None
+
+            told = wait_for("sectors that know the ground", sectors)
+            clearance = decode_grid(wait_for("clearance", lambda: client.get(f"{BASE}/map/clearance"))[0].payload)
             health = json.loads(client.get(f"{BASE}/health/json")[0].payload)
         assert document["schema"] == "umfeld.planes.v1"
         assert {plane["mount"] for plane in document["planes"]} == {"mast"}
         upright = [plane for plane in document["planes"] if abs(plane["normal"][2]) < 0.03]
         assert len(upright) >= 2, "walls stand upright"
+        assert ground["schema"] == "umfeld.elevation.v1"
+        assert ground["cells"]["traversable"] > 100
+        level = [h for row in zip(ground["height_m"], ground["ground"]) for h, kind in zip(*row) if kind == 0]
+        assert abs(float(np.median(level))) < 0.02
+        assert all(each["slope_rad"] is not None for each in told if each["traversable"])
+        assert {0, 100} < set(np.unique(clearance.cells).tolist())
         assert cloud.frame == "base_link"
         assert len(cloud.points_m) > 20_000
         assert 0.02 < np.mean(np.abs(cloud.points_m[:, 2]) < 0.05) < 0.95

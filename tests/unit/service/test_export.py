@@ -15,10 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from typer.testing import CliRunner
 
 from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
 from service import export
+from service.commands.map import app
 from service.export import MapFileTrouble, MapImage, image_of, load_pgm_yaml, patch_of, save_grid
 from service.files import FileTrouble, write_whole
 
@@ -261,6 +263,26 @@ def test_write_whole_replaces_or_leaves(tmp_path: Path) -> None:
     with pytest.raises(FileTrouble, match="cannot be written"):
         write_whole(folder, b"x")
     assert {p.name for p in tmp_path.iterdir()} == {"f", "folder"}
+
+
+def test_an_inflated_map_keeps_a_round_vehicle_clear(tmp_path: Path) -> None:
+    """`umfeld map export --inflate`: what is free stays so only where no obstacle comes as near as that; turned or
+    not, the file's origin and size stay."""
+    cells = np.zeros((40, 50), np.int8)
+    cells[20, 25], cells[:, 48:] = 100, -1
+    source = MapImage(cells, 0.1, Pose2(1.23, -4.0, 0.3))
+    save_grid(source, tmp_path / "plain.yaml")
+    result = CliRunner().invoke(
+        app, ["export", str(tmp_path / "wide.yaml"), "--store", str(tmp_path / "plain.yaml"), "--inflate", "0.5"]
+    )
+    assert result.exit_code == 0, result.output
+    wide = load_pgm_yaml(tmp_path / "wide.yaml")
+    assert (wide.origin, wide.resolution_m, wide.cells.shape) == (source.origin, 0.1, cells.shape)
+    row, col = np.mgrid[:40, :50]
+    between = np.hypot(np.maximum(abs(row - 20) - 1, 0), np.maximum(abs(col - 25) - 1, 0)) * 0.1  # of nearest points
+    assert (wide.cells[between < 0.5] == 100).all()
+    assert (wide.cells[(between > 0.7) & (cells == 0)] == 0).all()
+    assert (wide.cells[:, 48:] == -1).all()
 
 
 @pytest.mark.data

@@ -1,0 +1,120 @@
+"""Room around obstacles in the daemon: the grid in, `map/clearance` out (S30).
+
+Each cell says how near the next occupied cell is, as a cost that falls evenly with the distance, so that the same
+numbers can be shown, planned on, and turned back into metres: distance = (1 - cost / 100) * reach, to a hundredth of
+the reach and never too far. Exact distances are kept up to date from what changed in the grid.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.grids.clearance import MAX_SIDE_CELLS, DistanceField
+from mapping.grids.patch import GridPatch
+from mapping.scan import Scan
+from service.map_makers import MapView, Rect, Tile
+from service.outputs import GridOut, Output
+
+F64 = NDArray[np.float64]
+I8 = NDArray[np.int8]
+Bools = NDArray[np.bool_]
+
+NAME = "clearance"
+_OCCUPIED_PERCENT = 65
+_CELL_NS = 1000  # a map of more than a million cells is told less often than once a second
+
+
+class ClearanceMaker:
+    """A map maker that keeps distances to what the grid calls occupied.
+
+    reach_m: farther away the cost is 0.  unknown_is_obstacle: distances also to what was never seen.
+    Unknown cells stay unknown (-1), whatever lies beside them.
+    """
+
+    def __init__(
+        self, *, reach_m: float = 2.0, unknown_is_obstacle: bool = False, period_ns: int = 1_000_000_000
+    ) -> None:
+        if not (math.isfinite(reach_m) and reach_m > 0.0):
+            raise ValueError(f"reach_m is a length above 0, got {reach_m}")
+        self.name = NAME
+        self.sources: frozenset[str] = frozenset()
+        self._period_ns = period_ns
+        self._reach_m = reach_m
+        self._unknown_is_obstacle = unknown_is_obstacle
+        self._field: DistanceField | None = None
+        self._place: tuple[float, int, int] | None = None
+        self._epoch = 0
+
+    @property
+    def period_ns(self) -> int:
+        """Longer the larger the map: what is told stays about a million cells a second."""
+        cells = 0 if self._field is None else self._field.squared.size
+        return max(self._period_ns, cells * _CELL_NS)
+
+    def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
+        """Everything it needs stands in the grid."""
+
+    def make(self, view: MapView) -> list[Output]:
+        """The layer as the grid is now, if that changed."""
+        grid = view.grid
+        if grid is None or not view.changed or grid.cells.size == 0 or max(grid.cells.shape) > MAX_SIDE_CELLS - 2:
+            return []
+        field = self._follow(grid, view.changed)
+        rows, cols = _known_part(grid.cells)
+        cells = np.full(grid.cells[rows, cols].shape, -1, dtype=np.int8)
+        known = grid.cells[rows, cols] >= 0
+        costs = self._costs(grid.resolution_m)
+        squared = field.squared[1:-1, 1:-1][rows, cols]
+        cells[known] = costs[np.minimum(squared[known], len(costs) - 1)]
+        self._epoch += 1
+        patch = GridPatch(grid.resolution_m, grid.row0 + rows.start, grid.col0 + cols.start, cells)
+        return [GridOut(view.stamp_ns, self._epoch, patch, name=NAME)]
+
+    def _follow(self, grid: GridPatch, changed: tuple[Rect, ...]) -> DistanceField:
+        place = (grid.resolution_m, grid.row0, grid.col0)
+        field = self._field
+        rows, cols = grid.cells.shape
+        if field is None or self._place != place or field.shape != (rows + 2, cols + 2):
+            around = np.pad(self._obstacles(grid.cells), 1, constant_values=self._unknown_is_obstacle)
+            field = self._field = DistanceField(around)  # with a rim of one cell: outside, nothing is known
+            self._place = place
+            return field
+        added, removed = [], []
+        for rect in changed:
+            row, col = max(rect.row0 - grid.row0, 0), max(rect.col0 - grid.col0, 0)
+            part = np.s_[row : rect.row0 + rect.rows - grid.row0, col : rect.col0 + rect.cols - grid.col0]
+            now, was = self._obstacles(grid.cells[part]), field.obstacle[1:-1, 1:-1][part]
+            added.append(np.argwhere(now & ~was) + (row + 1, col + 1))
+            removed.append(np.argwhere(was & ~now) + (row + 1, col + 1))
+        field.update(np.concatenate(added), np.concatenate(removed))
+        return field
+
+    def _obstacles(self, cells: I8) -> Bools:
+        occupied = cells >= _OCCUPIED_PERCENT
+        return occupied | (cells < 0) if self._unknown_is_obstacle else occupied
+
+    def _costs(self, resolution_m: float) -> I8:
+        """By squared distance in cells, the last for all that is farther; rounded so that no distance grows."""
+        farthest = math.ceil((self._reach_m / resolution_m) ** 2)
+        share = np.sqrt(np.arange(farthest + 1)) * (resolution_m / self._reach_m)
+        return np.clip(np.ceil(100.0 * (1.0 - share) - 1e-9), 0, 100).astype(np.int8)
+
+    def changed_tiles(self) -> list[Tile]:
+        return []
+
+    def restore(self, tiles: Iterable[Tile]) -> None:
+        """It comes with the grid."""
+        self._field = None
+
+
+def _known_part(cells: I8) -> tuple[slice, slice]:
+    """Rows and columns around what is known; one cell if nothing is."""
+    known = cells >= 0
+    rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    if not len(rows):
+        return slice(0, 1), slice(0, 1)
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
