@@ -21,7 +21,7 @@ class SectorGround:
 
     traversable_m: from the origin, as far as every cell of the wedge is TRAVERSABLE; 0 if not even the first is.
     stopped_by: Ground of the nearest cell that is not, TRAVERSABLE if there is none within reach.
-    slope_rad: the steepest of the cells up to there, NaN without one.
+    slope_rad: the steepest of the cells from blind_m up to there, NaN without one.
     """
 
     traversable_m: F64
@@ -35,7 +35,8 @@ def ground_in_sectors(
     """What the elevation map says about each wedge of bearings.
 
     edges_rad: (N + 1,) ascending, in the virtual sensor's frame, as in PolarSnapshot.  reach_m: how far to look.
-    blind_m: cells whose centre is nearer are passed over: the vehicle stands on them and hides them.
+    blind_m: unknown cells whose centre is nearer are passed over: the vehicle hides them. What is known to be in the
+    way there stops all the same.
     A cell counts in every wedge that its circle around touches, at the distance of its nearest point. Cells outside
     of the map are unknown, and stop.  Raises ValueError for edges that do not rise, or a reach that is no length.
     """
@@ -50,9 +51,9 @@ def ground_in_sectors(
     rows, cols = np.mgrid[row - around : row + around + 1, col - around : col + around + 1].reshape(2, -1)
     x, y = (cols + 0.5) * d - map_from_sensor.x_m, (rows + 0.5) * d - map_from_sensor.y_m
     distance = np.hypot(x, y)
-    wanted = (distance - half < reach_m) & (distance >= blind_m)
-    rows, cols, x, y, distance = rows[wanted], cols[wanted], x[wanted], y[wanted], distance[wanted]
     ground, slope = _look_up(elevation, rows, cols)
+    wanted = (distance - half < reach_m) & ((distance >= blind_m) | (ground != Ground.UNKNOWN))
+    x, y, distance, ground, slope = x[wanted], y[wanted], distance[wanted], ground[wanted], slope[wanted]
     middle = (edges_rad[0] + edges_rad[-1]) / 2.0
     bearing = np.arctan2(y, x) - map_from_sensor.yaw_rad
     bearing = middle + np.mod(bearing - middle + math.pi, 2.0 * math.pi) - math.pi
@@ -66,7 +67,7 @@ def ground_in_sectors(
         if stops.any():
             first = np.flatnonzero(stops)[np.argmin(nearest[stops])]
             reached[k], stopped[k] = min(float(nearest[first]), reach_m), ground[first]
-        driven = inside & (nearest < reached[k]) & ~np.isnan(slope)
+        driven = inside & (nearest < reached[k]) & (distance >= blind_m) & ~np.isnan(slope)
         if driven.any():
             steepest[k] = slope[driven].max()
     return SectorGround(reached, stopped, steepest)

@@ -181,6 +181,13 @@ def test_sectors_say_where_the_ground_can_be_driven_on() -> None:
     assert (hidden["traversable"], hidden["traversable_m"]) == (None, 0.0), "what lies before the outline is not known"
 
 
+def test_what_is_known_to_be_in_the_way_counts_where_nothing_is_asked_too() -> None:
+    maker = ElevationMaker()
+    told(maker, cloud(0, ground_points(box=True)))
+    left = sectors(teller(maker, 1.4), SECOND)[-1]
+    assert (left["traversable"], left["traversable_m"]) == (False, 0.0)
+
+
 def test_the_ground_turns_with_the_vehicle() -> None:
     maker = ElevationMaker()
     told(maker, cloud(0, ground_points(box=True)))
