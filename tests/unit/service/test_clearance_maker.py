@@ -86,7 +86,7 @@ def test_changes_give_what_a_new_map_gives() -> None:
     maker = ClearanceMaker(reach_m=REACH_M)
     told(maker, patch)
     for number in range(20):
-        row, col = rng.integers(0, 50), rng.integers(0, 80)
+        row, col = int(rng.integers(0, 50)), int(rng.integers(0, 80))
         part = np.s_[row : row + 8, col : col + 10]
         patch.cells[part] = random_cells(10 + number)[part]
         rows, cols = patch.cells[part].shape
