@@ -1,6 +1,6 @@
 """Where am I, by anchor graphs alone: scenes from the first 60 % of a recorded run, questions from the rest.
 
-    UMFELD_DATA=... python bench/relocalise_features.py [--json FILE]
+    UMFELD_DATA=... python bench/relocalise_features.py [--json FILE] [--across]
 
 Truth: the corrected paths of the logs (gfs). A scene and a question every 0.4 m or 20 degrees; each question is one
 single scan, without a hint. Figures, over the questions asked from where the place was seen before (a scene was taken
@@ -10,6 +10,9 @@ wrong    another place was told
 unknown  no place was told
 Then the time of a question against 1, 4 and 16 times the scenes (the run's, laid out again 1 km apart with other walls:
 mirrored and stretched) and with 1, 4 and 16 times the beams (of a simulated room).
+
+--across does something else: least_score and least_lead are chosen on one log alone, and judged on the other. Chosen are
+those with the most right answers among questions seen before (1 m, 45 degrees) while at most 2 % of these are wrong.
 """
 
 from __future__ import annotations
@@ -21,8 +24,10 @@ import math
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +37,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from drivers.logs import read_log
-from mapping.features.scenes import SceneDatabase, Sight, sight_of
+from mapping.features.scenes import Answer, RecogniseRules, SceneDatabase, Sight, sight_of
 from mapping.frames import Pose2, wrap_angle
 from mapping.scan import Scan
 
@@ -43,6 +48,7 @@ LOGS = ("intel", "fr079")
 SHARE = 0.6
 STEP_M, STEP_RAD = 0.4, math.radians(20.0)
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
+WRONG_SHARE = 0.02
 SEEN = {"seen before, 1 m and 45 deg": (1.0, 45.0), "seen before, 2 m and 60 deg": (2.0, 60.0)}
 
 
@@ -86,11 +92,15 @@ def remembered(scans: list[Posed]) -> SceneDatabase:
 
 def outcome(database: SceneDatabase, sight: Sight, truth: Pose2) -> str:
     place = database.where_am_i(sight).place
-    if place is None:
-        return "unknown"
-    found = place.map_from_sensor
-    is_right = distance(found, truth) < RIGHT_M and abs(wrap_angle(found.yaw_rad - truth.yaw_rad)) < RIGHT_RAD
-    return "right" if is_right else "wrong"
+    return "unknown" if place is None else judged(place.map_from_sensor, truth)
+
+
+def judged(found: Pose2, truth: Pose2) -> str:
+    return "right" if is_near(found, truth, RIGHT_M, RIGHT_RAD) else "wrong"
+
+
+def is_near(a: Pose2, b: Pose2, within_m: float, within_rad: float) -> bool:
+    return distance(a, b) < within_m and abs(wrap_angle(a.yaw_rad - b.yaw_rad)) < within_rad
 
 
 def relocalise(name: str) -> dict[str, Any]:
@@ -105,6 +115,75 @@ def relocalise(name: str) -> dict[str, Any]:
         for label in seen or ["not seen before"]:
             tables[label][told] += 1
     return {"scenes": len(database), "anchors": database.anchors, "memory_bytes": database.memory_bytes, **tables}
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A question, all that was considered as its answer, and whether the place was seen before (1 m, 45 degrees)."""
+
+    truth: Pose2
+    answer: Answer
+    seen: bool
+
+    def outcome(self, rules: RecogniseRules) -> str:
+        """As `outcome`, had the answer been given by these rules: least_score, least_lead and least_partners."""
+        if not self.answer.candidates:
+            return "unknown"
+        best, *others = self.answer.candidates
+        place = best.map_from_sensor
+        rivals = [
+            each.score
+            for each in others
+            if not is_near(place, each.map_from_sensor, rules.apart_m, math.radians(rules.apart_deg))
+        ]
+        lead = best.score - max(rivals, default=-math.inf)
+        if best.score < rules.least_score or best.partners < rules.least_partners or lead < rules.least_lead:
+            return "unknown"
+        return judged(place, self.truth)
+
+
+def asked(name: str) -> list[Asked]:
+    """Every question of a log."""
+    scans = posed_scans(name)
+    cut = round(SHARE * len(scans))
+    database = remembered(scans[:cut])
+    within_m, within_deg = next(iter(SEEN.values()))
+    found = []
+    for scan, pose in spaced(scans[cut:]):
+        place, turn = database.apart(pose)
+        seen = bool(np.any((place < within_m) & (turn < math.radians(within_deg))))
+        found.append(Asked(pose, database.where_am_i(sight_of(scan)), seen))
+    return found
+
+
+def table(questions: list[Asked], rules: RecogniseRules) -> Counter[str]:
+    return Counter({"right": 0, "wrong": 0, "unknown": 0}) + Counter(each.outcome(rules) for each in questions)
+
+
+def chosen(questions: list[Asked]) -> RecogniseRules:
+    """Of the rules that are wrong seldom enough, those that are right most often; the strictest of equals."""
+    seen = [each for each in questions if each.seen]
+    best, most = RecogniseRules(least_score=0.9, least_lead=0.3), -1
+    for score, lead in product(np.arange(90, 49, -5), np.arange(30, 0, -5)):
+        rules = RecogniseRules(least_score=score / 100, least_lead=lead / 100)
+        counts = table(seen, rules)
+        if counts["wrong"] <= WRONG_SHARE * len(seen) and counts["right"] > most:
+            best, most = rules, counts["right"]
+    return best
+
+
+def across() -> dict[str, Any]:
+    """Rules chosen on each log, and what they do on both."""
+    questions = {name: asked(name) for name in LOGS}
+    report: dict[str, Any] = {}
+    for name in LOGS:
+        rules = chosen(questions[name])
+        report[f"chosen on {name}"] = entry = {"least_score": rules.least_score, "least_lead": rules.least_lead}
+        for judge in LOGS:
+            for seen in (True, False):
+                some = [each for each in questions[judge] if each.seen == seen]
+                entry[f"{judge}, {'' if seen else 'not '}seen before"] = dict(table(some, rules))
+    return report
 
 
 def question_ms(database: SceneDatabase, sights: list[Sight], rounds: int = 3) -> dict[str, float]:
@@ -181,17 +260,21 @@ def growth_with_beams() -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--across", action="store_true")
     arguments = parser.parse_args()
     if "UMFELD_DATA" not in os.environ:
         parser.error("set UMFELD_DATA to the folder of recorded data")
+    if arguments.across:
+        print(json.dumps(across(), indent=2))
+        return
     report: dict[str, Any] = {name: relocalise(name) for name in LOGS}
     for name in LOGS:
         print(f"{name}: {report[name]['scenes']} scenes, {report[name]['anchors']} anchors")
         for label in (*SEEN, "not seen before"):
-            table = report[name][label]
-            asked = sum(table.values())
-            shares = ", ".join(f"{key} {n} ({100 * n / max(asked, 1):.1f} %)" for key, n in table.items())
-            print(f"  {label}: {asked} asked; {shares}")
+            counts = report[name][label]
+            total = sum(counts.values())
+            shares = ", ".join(f"{key} {n} ({100 * n / max(total, 1):.1f} %)" for key, n in counts.items())
+            print(f"  {label}: {total} asked; {shares}")
     report["scenes"] = growth_with_scenes("fr079")
     report["beams"] = growth_with_beams()
     for part in ("scenes", "beams"):

@@ -518,6 +518,7 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
             _sources(config, config.grid.sources, found),
             publish_period_ns=round(config.grid.publish_period_s * 1e9),
             update_period_ns=round(config.grid.update_period_s * 1e9),
+            halve_period_ns=round(config.grid.halve_every_s * 1e9),
         )
         grids.append(building)
     if config.local_grid.enabled:
@@ -528,6 +529,7 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
                 RollingGrid(side_m=local.size_m, resolution_m=local.resolution_m, model=local.model),
                 _sources(config, local.sources, found),
                 period_ns=round(local.period_s * 1e9),
+                halve_period_ns=round(local.halve_every_s * 1e9),
             )
         )
     sectors = tuple(_sector_maps(config))
@@ -756,6 +758,8 @@ def _in_order(config: Config, references: Sequence[str]) -> tuple[str, ...]:
 
 def parts(config: Config, found: Mapping[str, Sensor], made: Maps, localiser: Localiser) -> Parts:
     """What fusion is made of."""
+    from mapping.sectors.footprint import checked_polygon
+
     drive = None
     if config.drive.source is not None:
         drive = (config.source_name("wheels", config.drive.source), geometry_of(config.drive))
@@ -768,6 +772,7 @@ def parts(config: Config, found: Mapping[str, Sensor], made: Maps, localiser: Lo
         max_wheel_speed_m_s=config.drive.max_wheel_speed_m_s,
         localiser=localiser,
         mounts=tilting_lasers(config),
+        footprint=checked_polygon(config.robot.footprint_m),
         wait_ns=config.alignment.odometry_wait_ms * 1_000_000,
         odometry_memory_s=config.alignment.odometry_memory_s,
     )

@@ -72,6 +72,9 @@ class Grid(Section):
     resolution_m: float = Field(default=0.05, ge=0.005, le=1.0, description="Edge of a cell.")
     model: Literal["counters", "log-odds"] = Field(default="counters", description="What a cell remembers.")
     sources: tuple[Reference, ...] | None = Field(default=None, description="Sensors that draw it; default: all.")
+    halve_every_s: float = Field(
+        default=0.0, ge=0, le=86400, description="Forget half of all evidence so often, wherever it is; 0: never."
+    )
     publish_period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two whole grids.")
     update_period_s: float = Field(default=0.2, ge=0.2, le=3600, description="Shortest time between two updates.")
 
@@ -85,6 +88,9 @@ class LocalGrid(Section):
     resolution_m: float = Field(default=0.05, ge=0.005, le=1.0, description="Edge of a cell.")
     model: Literal["counters", "log-odds"] = Field(default="counters", description="What a cell remembers.")
     sources: tuple[Reference, ...] | None = Field(default=None, description="Sensors that draw it; default: all.")
+    halve_every_s: float = Field(
+        default=0.0, ge=0, le=86400, description="Forget half of all evidence so often, wherever it is; 0: never."
+    )
 
 
 class Artos(Section):

@@ -4,7 +4,7 @@ outputs bit for bit.
 A laser's sweep goes three ways. As it is: ScanOut. At once into the sector maps, de-skewed with the odometry known by
 then; where odometry has not reached the last beams yet the newest pose is held, because a sector map that waits is
 late (at 100 Hz odometry the hold is 10 ms at most, 1 cm at 1 m/s). And into the grids, where a wrong place stays
-wrong for long: there it waits until odometry covers the whole sweep, at most `wait_ns`, and is dropped otherwise; then
+wrong for long: there, without mixed pixels and without what ends on the robot itself, it waits until odometry covers the whole sweep, at most `wait_ns`, and is dropped otherwise; then
 the localiser sees it before it is drawn. While the localiser waits for a result, scans are held back; the pose is not.
 
 Input never stops fusion. What cannot be used is dropped and counted by source and reason:
@@ -46,9 +46,11 @@ from drivers.readings import (
 from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
 from mapping.kernels import motion
+from mapping.mixed_pixels import without_mixed_pixels
 from mapping.odometry import DifferentialOdometry, DriveGeometry, FollowedPoses, OdometryState
 from mapping.pose_buffer import GoneError, PoseBuffer
 from mapping.scan import Scan
+from mapping.sectors.inputs import without_self
 from service.align import WaitingRoom
 from service.mounts import TiltingLaser
 from service.outputs import LookOut, OdomOut, Output, PolarOut, PoseOut, RangesOut, RectOut, ScanOut
@@ -270,7 +272,8 @@ class Parts:
 
     drive: name of the source whose counts make odometry, and the geometry to read them by.  pose_source: name of
     another estimator whose poses are used instead; without either the robot is taken to stand still.  wait_ns: how
-    long a sweep waits for odometry.
+    long a sweep waits for odometry.  footprint: (V, 2) outline of the robot in its base frame; beams that end on it are
+    left out of whatever is drawn.
     """
 
     sensors: Mapping[str, Sensor]
@@ -281,6 +284,7 @@ class Parts:
     max_wheel_speed_m_s: float = 5.0
     localiser: Localiser = field(default_factory=OdometryOnly)
     mounts: Sequence[TiltingLaser] = ()
+    footprint: F64 | None = None
     wait_ns: int = 500_000_000
     odometry_memory_s: float = 30.0
 
@@ -315,6 +319,7 @@ class Fusion:
         self._sectors_untold: set[int] = set()  # changed since they were published
         self._newest_stamp_ns = 0
         self._late_since_ns: int | None = None
+        self._mixed_pixels = self._beams_on_robot = 0
         self._tilting = {mount.settings.laser: mount for mount in parts.mounts}
         self._by_axle = {mount.settings.name: mount for mount in parts.mounts}
         self._around = [grid for grid in parts.grids if isinstance(grid, FollowsCorrections)]
@@ -382,6 +387,8 @@ class Fusion:
         return {
             "fusion.waiting_for_odometry": len(self._waiting),
             "fusion.held_back": len(self._held),
+            "fusion.mixed_pixels": self._mixed_pixels,
+            "fusion.beams_on_robot": self._beams_on_robot,
             **self._parts.localiser.counters(),
         }
 
@@ -436,7 +443,8 @@ class Fusion:
                 yield self._tell(index, now_ns)
         yield ScanOut(laser.name, scan, laser.base_from_sensor, laser.height_m)
         self._newest_stamp_ns = max(self._newest_stamp_ns, scan.stamp_ns)
-        self._wait_for_poses(laser.name, scan, scan.stamp_ns, _last_beam_ns(scan), now_ns)
+        if self._is_drawn(laser.name):
+            self._wait_for_poses(laser.name, self._to_draw(laser, scan), scan.stamp_ns, _last_beam_ns(scan), now_ns)
 
     def _on_tilted_scan(self, laser: Laser, reading: ScanReading, now_ns: int) -> list[Output]:
         """A sweep that is not level goes into no flat map."""
@@ -490,6 +498,20 @@ class Fusion:
             float(reading.range_min_m),
             float(reading.range_max_m),
         )
+
+    def _to_draw(self, laser: Laser, scan: Scan) -> Scan:
+        """The scan without what ends on the robot itself, and without mixed pixels."""
+        ranges, mixed = without_mixed_pixels(scan.bearing_rad, scan.range_m)
+        self._mixed_pixels += mixed
+        footprint = self._parts.footprint
+        if footprint is not None:
+            seen = ranges
+            ranges = without_self(
+                scan.bearing_rad, seen, laser.base_from_sensor, footprint, too_close_m=scan.range_min_m
+            )
+            if ranges is not seen:
+                self._beams_on_robot += int(np.isnan(ranges).sum() - np.isnan(seen).sum())
+        return replace(scan, range_m=ranges)
 
     def _as_seen_now(self, scan: Scan, base_from_sensor: Pose2) -> tuple[Scan, Pose2]:
         """The scan de-skewed as far as odometry is known, and its sensor's pose as seen from where the base is now."""
@@ -678,9 +700,12 @@ class Fusion:
     def _wait_for_poses(
         self, source: str, value: Scan | Round | Touch, first_ns: int, last_ns: int, now_ns: int
     ) -> None:
-        if any(source in grid.sources for grid in self._parts.grids):
+        if self._is_drawn(source):
             for lost, reason in self._waiting.put(source, value, first_ns, last_ns, now_ns):
                 self._drop(lost, reason)
+
+    def _is_drawn(self, source: str) -> bool:
+        return any(source in grid.sources for grid in self._parts.grids)
 
     def _draw(self, source: str, value: Scan | Round | Touch) -> None:
         if not self._moves:

@@ -25,6 +25,7 @@ F64 = NDArray[np.float64]
 
 _CELLS_A_SECOND = 1_000_000  # a grid of more cells is sent whole less often, and by updates between
 _STILL_M = 1e-3
+_HALVINGS_MAX = 16  # nothing is left after so many
 _TOUCHED_SURELY = 0.7
 _TOUCHES_MAX = 300  # more than a cell can have been looked through
 _STILL_RAD = 2e-4  # 6 mm at 30 m
@@ -76,6 +77,27 @@ def insert_touch(grid: EvidenceGrid, touch: Touch, map_from_base: Pose2) -> None
         grid.insert_cells(np.unique(cells, axis=0), nothing)
         if (grid.probability_at(line) > _TOUCHED_SURELY).all():
             break
+
+
+class Forgetting:
+    """When a grid halves its evidence, by the stamps of what is drawn into it. period_ns: 0 never."""
+
+    def __init__(self, grid: EvidenceGrid, period_ns: int) -> None:
+        self._grid = grid
+        self._period_ns = period_ns
+        self._halved_ns: int | None = None
+
+    def move_on(self, stamp_ns: int) -> None:
+        """To be called before what was seen at this stamp is drawn."""
+        if self._period_ns == 0:
+            return
+        if self._halved_ns is None:
+            self._halved_ns = stamp_ns
+        times = (stamp_ns - self._halved_ns) // self._period_ns
+        if times > 0:
+            self._halved_ns += times * self._period_ns
+            for _ in range(min(times, _HALVINGS_MAX)):
+                self._grid.decay()
 
 
 class PolarLayer:
@@ -170,9 +192,17 @@ class BuildingLayer:
     """The map-fixed grid: sent whole when it has grown or after a while, by changed rectangles between."""
 
     def __init__(
-        self, grid: OccupancyGrid, sources: Iterable[str], *, publish_period_ns: int, update_period_ns: int
+        self,
+        grid: OccupancyGrid,
+        sources: Iterable[str],
+        *,
+        publish_period_ns: int,
+        update_period_ns: int,
+        halve_period_ns: int = 0,
     ) -> None:
+        """halve_period_ns: how often half of all evidence is forgotten; 0 never."""
         self.grid = grid
+        self._forgetting = Forgetting(grid, halve_period_ns)
         self.sources = frozenset(sources)
         self._publish_period_ns = publish_period_ns
         self._update_period_ns = update_period_ns
@@ -184,9 +214,11 @@ class BuildingLayer:
         self._outgrown = True  # something changed outside the last full grid
 
     def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
+        self._forgetting.move_on(scan.stamp_ns)
         insert_sweep(self.grid, scan, map_from_sensor)
 
     def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
+        self._forgetting.move_on(heard.stamp_ns)
         insert_round(self.grid, source, heard, map_from_base)
 
     def take_touch(self, source: str, touch: Touch, map_from_base: Pose2) -> None:
@@ -235,9 +267,13 @@ class BuildingLayer:
 class RollingLayer:
     """A grid around the robot, in the map frame, that forgets what it leaves behind: sent whole."""
 
-    def __init__(self, name: str, grid: RollingGrid, sources: Iterable[str], *, period_ns: int) -> None:
+    def __init__(
+        self, name: str, grid: RollingGrid, sources: Iterable[str], *, period_ns: int, halve_period_ns: int = 0
+    ) -> None:
+        """halve_period_ns: how often half of all evidence is forgotten; 0 never."""
         self.name = name
         self.grid = grid
+        self._forgetting = Forgetting(grid, halve_period_ns)
         self.sources = frozenset(sources)
         self._period_ns = period_ns
         self._told_ns: int | None = None
@@ -247,11 +283,13 @@ class RollingLayer:
     def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
         middle = np.atleast_2d(map_from_sensor)[-1]
         self.grid.centre_on(float(middle[0]), float(middle[1]))
+        self._forgetting.move_on(scan.stamp_ns)
         insert_sweep(self.grid, scan, map_from_sensor)
         self._changed = True
 
     def take_round(self, source: str, heard: Round, map_from_base: Pose2) -> None:
         self.grid.centre_on(map_from_base.x_m, map_from_base.y_m)
+        self._forgetting.move_on(heard.stamp_ns)
         insert_round(self.grid, source, heard, map_from_base)
         self._changed = True
 

@@ -473,11 +473,16 @@ def insert_listed(
 
 @njit(cache=True, nogil=True)
 def halve_cells(cells: Any, start: int, stop: int, model: int) -> None:
-    """Forget half of what was counted; a cell with nothing left becomes unknown."""
+    """Forget half of what was counted; a cell with nothing left becomes unknown. None becomes freer by rounding."""
     for at in range(np.uint64(start), np.uint64(stop)):
         v = np.int32(cells[at])
         if model == COUNTERS:
-            cells[at] = np.uint16((v >> 1) & 0x7F7F)
+            hits, misses = v >> 8, v & 0xFF
+            total = (hits + misses) >> 1
+            left = min((hits + 1) >> 1, total)
+            if total == 1 and hits > 0 and misses > 0:
+                total = left = 0  # one count cannot tell what two that disagree have told
+            cells[at] = np.uint16(left << 8 | (total - left))
         elif v != 0:
             odds = v - np.int32(ODDS_ZERO)
             half = (abs(odds) >> 1) * (1 if odds > 0 else -1)

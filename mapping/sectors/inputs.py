@@ -67,8 +67,17 @@ def checked_beams(bearing_rad: ArrayLike, range_m: ArrayLike) -> tuple[F64, F64]
     return (bearing, ranges) if good.all() else (bearing[good], ranges[good])
 
 
-def without_self(bearing_rad: F64, range_m: F64, base_from_sensor: Pose2, footprint: F64) -> F64:
-    """(N,) ranges in which what ends on the vehicle itself is invalid: it is no obstacle and frees nothing."""
+def without_self(
+    bearing_rad: F64, range_m: F64, base_from_sensor: Pose2, footprint: F64, *, too_close_m: float | None = None
+) -> F64:
+    """(N,) ranges in which what ends on the vehicle itself is invalid: it is no obstacle and frees nothing.
+
+    too_close_m: where a map would put what is too close (-inf); None: such beams are left as they are.
+    """
+    if too_close_m is not None:
+        ends_m = np.where(np.isneginf(range_m), too_close_m, range_m)
+        cleaned = without_self(bearing_rad, ends_m, base_from_sensor, footprint)
+        return range_m if cleaned is ends_m else np.where(np.isnan(cleaned), np.nan, range_m)
     reach_m = float(np.hypot(footprint[:, 0], footprint[:, 1]).max()) + math.hypot(
         base_from_sensor.x_m, base_from_sensor.y_m
     )

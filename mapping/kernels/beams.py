@@ -1,0 +1,73 @@
+"""Compiled loops over the beams of one sweep, before anything is drawn from it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from numba import njit
+
+TWO_PI = 2.0 * math.pi
+
+
+@njit(cache=True, nogil=True)
+def angle_between(a: float, b: float) -> float:
+    """How far two bearings are apart, 0 to pi."""
+    turn = abs(a - b) % TWO_PI
+    return min(turn, TWO_PI - turn)
+
+
+@njit(cache=True, nogil=True)
+def goes_on(r: float, r_next: float, r_second: float, turn: float, turn_on: float, off_m: float) -> bool:
+    """Whether a beam of length r ends on the straight wall through the ends of the next two to one side."""
+    if not (r_second > 0.0 and math.isfinite(r_second) and turn_on > 0.0):
+        return False
+    # A line in polar form: 1/r = A cos(bearing) + B sin(bearing), so from any three of its points
+    # sin(turn_on) / r = sin(turn + turn_on) / r_next - sin(turn) / r_second.
+    inverse = (math.sin(turn + turn_on) / r_next - math.sin(turn) / r_second) / math.sin(turn_on)
+    # Each of the three may be off by off_m: the first derivatives of r by them, at small turns; but half of the step is
+    # no noise.
+    off = min(off_m * (1.0 + 2.0 * (r / r_next) ** 2 + (r / r_second) ** 2), 0.5 * abs(r - r_next))
+    return bool(inverse > 0.0 and abs(r - 1.0 / inverse) <= off)
+
+
+@njit(cache=True, nogil=True)
+def drop_mixed(
+    bearing: Any, distance: Any, cot_grazing: float, step_m: float, off_m: float, widest: float, kept: Any
+) -> int:
+    """Copy (N,) distances into kept (N,), with NaN for those of mixed pixels; returns how many.
+
+    The beams are a turn or a part of one in order. A beam is judged by its neighbours, two to either side; the first of
+    either side must be there: see mapping.mixed_pixels.
+    """
+    n = len(distance)
+    for k in range(n):
+        kept[k] = distance[k]
+    if n < 5:
+        return 0
+    dropped = 0
+    for k in range(n):
+        after = k + 1 if k + 1 < n else 0
+        r, r_before, r_after = distance[k], distance[k - 1], distance[after]
+        up, down = r_after - r, r - r_before  # NaN fails the test below
+        if not (min(up, down) > step_m or max(up, down) < -step_m):
+            continue
+        if not (r_before > 0.0 and r > 0.0 and r_after > 0.0 and math.isfinite(up + down)):
+            continue
+        turn_before, turn_after = angle_between(bearing[k], bearing[k - 1]), angle_between(bearing[k], bearing[after])
+        narrow, wide = min(turn_before, turn_after), max(turn_before, turn_after)
+        if narrow <= 0.0 or wide > widest or wide > 1.5 * narrow:
+            continue
+        # Chords to both sides run along the beam: much farther that way than across it.
+        if abs(down) < cot_grazing * min(r, r_before) * turn_before:
+            continue
+        if abs(up) < cot_grazing * min(r, r_after) * turn_after:
+            continue
+        last = after + 1 if after + 1 < n else 0
+        if goes_on(r, r_before, distance[k - 2], turn_before, angle_between(bearing[k - 1], bearing[k - 2]), off_m):
+            continue
+        if goes_on(r, r_after, distance[last], turn_after, angle_between(bearing[after], bearing[last]), off_m):
+            continue
+        kept[k] = math.nan
+        dropped += 1
+    return dropped
