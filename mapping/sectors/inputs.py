@@ -74,13 +74,15 @@ def without_self(
 
     too_close_m: where a map would put what is too close (-inf); None: such beams are left as they are.
     """
+    reach_m = float(np.hypot(footprint[:, 0], footprint[:, 1]).max()) + math.hypot(
+        base_from_sensor.x_m, base_from_sensor.y_m
+    )
+    if not (range_m <= reach_m).any():
+        return range_m
     if too_close_m is not None:
         ends_m = np.where(np.isneginf(range_m), too_close_m, range_m)
         cleaned = without_self(bearing_rad, ends_m, base_from_sensor, footprint)
         return range_m if cleaned is ends_m else np.where(np.isnan(cleaned), np.nan, range_m)
-    reach_m = float(np.hypot(footprint[:, 0], footprint[:, 1]).max()) + math.hypot(
-        base_from_sensor.x_m, base_from_sensor.y_m
-    )
     near = np.flatnonzero(np.isfinite(range_m) & (range_m >= 0.0) & (range_m <= reach_m))
     if len(near) == 0:
         return range_m
