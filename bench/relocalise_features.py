@@ -11,8 +11,8 @@ unknown  no place was told
 Then the time of a question against 1, 4 and 16 times the scenes (the run's, laid out again 1 km apart with other walls:
 mirrored and stretched) and with 1, 4 and 16 times the beams (of a simulated room).
 
---across does something else: least_score and least_lead are chosen on one log alone, and judged on the other. Chosen are
-those with the most right answers among questions seen before (1 m, 45 degrees) while at most 2 % of these are wrong.
+--across does something else: least_score and least_lead are chosen on one log alone, and judged on the other. Chosen
+are those with the most right answers among questions seen before (1 m, 45 degrees) while at most 2 % of these are wrong.
 """
 
 from __future__ import annotations

@@ -4,8 +4,9 @@ outputs bit for bit.
 A laser's sweep goes three ways. As it is: ScanOut. At once into the sector maps, de-skewed with the odometry known by
 then; where odometry has not reached the last beams yet the newest pose is held, because a sector map that waits is
 late (at 100 Hz odometry the hold is 10 ms at most, 1 cm at 1 m/s). And into the grids, where a wrong place stays
-wrong for long: there, without mixed pixels and without what ends on the robot itself, it waits until odometry covers the whole sweep, at most `wait_ns`, and is dropped otherwise; then
-the localiser sees it before it is drawn. While the localiser waits for a result, scans are held back; the pose is not.
+wrong for long: there, without mixed pixels and without what ends on the robot itself, it waits until odometry covers
+the whole sweep, at most `wait_ns`, and is dropped otherwise; then the localiser sees it before it is drawn. While the
+localiser waits for a result, scans are held back; the pose is not.
 
 Input never stops fusion. What cannot be used is dropped and counted by source and reason:
     stamp_equal, stamp_backward, stamp_ahead    not newer than the source's last, or from the future

@@ -268,7 +268,7 @@ class MapStore:
             version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
         return {
             "path": str(self.path),
-            "bytes": self.path.stat().st_size,
+            "bytes": bytes_of(self.path),
             "schema_version": version,
             "layers": self.layers(),
             "meta": self.meta(),
@@ -369,11 +369,17 @@ def check_file(path: Path) -> str | None:
     return None
 
 
+def bytes_of(path: Path) -> int:
+    """What a map takes on the disk, with what is not yet moved from its journal into the file itself."""
+    journal = path.with_name(f"{path.name}-wal")
+    return path.stat().st_size + (journal.stat().st_size if journal.exists() else 0)
+
+
 def list_maps(folder: Path) -> list[dict[str, Any]]:
     """The map files of a folder: name, path, bytes, when saved; damaged ones say so."""
     found = []
     for path in sorted(folder.glob(f"*{SUFFIX}")):
-        entry: dict[str, Any] = {"name": path.stem, "path": str(path), "bytes": path.stat().st_size}
+        entry: dict[str, Any] = {"name": path.stem, "path": str(path), "bytes": bytes_of(path)}
         try:
             with MapStore.open(path, wall_ns=lambda: 0, read_only=True) as store:
                 entry |= {"saved_ns": store.get_meta("saved_ns"), "layers": store.layers(), "trouble": None}

@@ -359,8 +359,8 @@ class EvidenceGrid:
     def decay(self) -> None:
         """Forget half of all evidence, for maps that should follow a changing world even where nobody looks.
 
-        Cells with next to nothing left become unknown, and none becomes freer than its evidence was. Call it from time to
-        time; one call costs about 2 us a tile.
+        Cells with next to nothing left become unknown, and none becomes freer than its evidence was. Call it from time
+        to time; one call costs about 2 us a tile.
         """
         pool = self._pool
         for slot in pool.slots():

@@ -1,4 +1,4 @@
-"""What takes evidence away makes no cell freer than its evidence was: mixed pixels, the robot's own body, forgetting."""
+"""What takes evidence away frees no cell by itself: the filters of mixed pixels and of the robot's body, forgetting."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from mapping.grids.occupancy import OccupancyGrid
 from service import assemble
 from service.config import Config
 from service.fusion import Fusion, OdometryOnly
-from sim_devices.floor_plan import Box, FloorPlan, Wall, WalkerPlan
+from sim_devices.floor_plan import Box, FloorPlan, WalkerPlan, Wall
 from sim_devices.world import World
 
 F64 = NDArray[np.float64]
@@ -62,9 +62,7 @@ class Robot:
 
 def seen(world: World, time_s: float) -> F64:
     count = BEARING.size
-    return world.beam_distances(
-        np.zeros((count, 2)), BEARING, np.full(count, time_s), z_m=LASER_Z_M, range_max_m=MAX_M
-    )
+    return world.beam_distances(np.zeros((count, 2)), BEARING, np.full(count, time_s), z_m=LASER_Z_M, range_max_m=MAX_M)
 
 
 def in_the_way(points: F64) -> F64:
