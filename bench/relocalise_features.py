@@ -12,7 +12,7 @@ Then the time of a question against 1, 4 and 16 times the scenes (the run's, lai
 mirrored and stretched) and with 1, 4 and 16 times the beams (of a simulated room).
 
 --across does something else: least_score and least_lead are chosen on one log alone, and judged on the other. Chosen
-are those with the most right answers among questions seen before (1 m, 45 degrees) while at most 2 % of these are wrong.
+are those with the most right answers among questions seen before (1 m, 45 degrees), at most 2 % of these wrong.
 """
 
 from __future__ import annotations
@@ -178,7 +178,8 @@ def across() -> dict[str, Any]:
     report: dict[str, Any] = {}
     for name in LOGS:
         rules = chosen(questions[name])
-        report[f"chosen on {name}"] = entry = {"least_score": rules.least_score, "least_lead": rules.least_lead}
+        entry: dict[str, Any] = {"least_score": rules.least_score, "least_lead": rules.least_lead}
+        report[f"chosen on {name}"] = entry
         for judge in LOGS:
             for seen in (True, False):
                 some = [each for each in questions[judge] if each.seen == seen]

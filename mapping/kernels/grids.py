@@ -475,7 +475,7 @@ def insert_listed(
 def halve_cells(cells: Any, start: int, stop: int, model: int) -> None:
     """Forget half of what was counted; a cell with nothing left becomes unknown. None becomes freer by rounding."""
     for at in range(np.uint64(start), np.uint64(stop)):
-        v = np.int32(cells[at])
+        v: Any = np.int32(cells[at])
         if model == COUNTERS:
             hits, misses = v >> 8, v & 0xFF
             total = (hits + misses) >> 1

@@ -14,8 +14,7 @@ from mapping.mixed_pixels import GRAZING_RAD, OFF_M, STEP_M, WIDEST_RAD, without
 
 F64 = NDArray[np.float64]
 
-DEG = math.radians(1.0)
-BEARING = np.arange(-30, 31) * 0.5 * DEG
+BEARING: F64 = np.radians(0.5 * np.arange(-30, 31, dtype=np.float64))
 FAR_M, NEAR_M = 4.0, 2.0
 
 

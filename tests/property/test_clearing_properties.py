@@ -73,7 +73,8 @@ def passed_by_a_beam(points: F64, pose: Pose2, ranges: F64) -> NDArray[np.bool_]
     along = local[:, :1] * np.cos(BEARING) + local[:, 1:] * np.sin(BEARING)
     across = local[:, 1:] * np.cos(BEARING) - local[:, :1] * np.sin(BEARING)
     half = D * math.sqrt(0.5) + 1e-9
-    return np.any((np.abs(across) <= half) & (along >= -half) & (along <= ends_m + half), axis=1)
+    on_beam = (np.abs(across) <= half) & (along >= -half) & (along <= ends_m + half)
+    return np.asarray(np.any(on_beam, axis=1))
 
 
 @SLOW
