@@ -114,11 +114,11 @@ def drive(name: str, laps: float, seed: int = 0) -> Drive:
     return Drive(world, motion, tuple((source, reading) for _, source, reading in items))
 
 
-def seen_m(world: World, bases: F64, stamps_s: F64) -> F64:
+def seen_m(world: World, bases: F64, stamps_s: F64, mount: Pose2 = MOUNT) -> F64:
     """Ranges of a sweep, each beam from its own pose of the base."""
     c, s = np.cos(bases[:, 2]), np.sin(bases[:, 2])
-    origin = bases[:, :2] + np.stack((c * MOUNT.x_m - s * MOUNT.y_m, s * MOUNT.x_m + c * MOUNT.y_m), axis=-1)
-    heading = bases[:, 2] + MOUNT.yaw_rad + BEARING
+    origin = bases[:, :2] + np.stack((c * mount.x_m - s * mount.y_m, s * mount.x_m + c * mount.y_m), axis=-1)
+    heading = bases[:, 2] + mount.yaw_rad + BEARING
     return world.beam_distances(origin, heading, stamps_s, z_m=HEIGHT_M, range_max_m=RANGE_MAX_M)
 
 
@@ -398,6 +398,87 @@ def test_lines_alone_hold_a_small_computers_robot() -> None:
             assert far.mean() < 0.05
     assert np.quantile(errors["lines"], 0.95) < 0.08
     assert np.quantile(errors["lines"], 0.95) < 0.1 * np.quantile(errors["wheels"], 0.95)
+
+
+# --- two lasers on one robot
+
+REAR = Pose2(-0.25, -0.1, math.pi - 0.15)
+TWO_LASERS = CONFIG.model_copy(
+    update={
+        "lasers": {
+            **CONFIG.lasers,
+            "rear": CONFIG.lasers["front"].model_copy(
+                update={
+                    "port": "/dev/none2",
+                    "mount": CONFIG.lasers["front"].mount.model_copy(
+                        update={"x_m": REAR.x_m, "y_m": REAR.y_m, "yaw_deg": math.degrees(REAR.yaw_rad)}
+                    ),
+                }
+            ),
+        }
+    }
+)
+
+
+@lru_cache(maxsize=1)
+def two_lasers() -> Drive:
+    """A quarter of the loop; the rear laser sweeps 50 ms after the front one."""
+    front, rng = drive("loop", 1.25), np.random.default_rng(4)
+    items = [item for item in front.items if item[1].stamp_ns < 16_000 * MS]
+    for source, reading in items.copy():
+        if source == "front" and isinstance(reading, ScanReading):
+            stamp_ns = reading.stamp_ns + SCAN_MS // 2 * MS
+            beams_s = (stamp_ns + np.arange(len(BEARING), dtype=np.float64) * reading.beam_period_ns) * 1e-9
+            reach = seen_m(front.world, front.motion.pose_at(beams_s), beams_s, REAR)
+            reach = reach + rng.normal(0.0, 0.01, len(reach))
+            items.append(("rear", replace(reading, stamp_ns=stamp_ns, range_m=reach)))
+    items = [item for item in items if item[0] == "base" or item[1].stamp_ns < 15_800 * MS]  # wheels go on longer
+    items.sort(key=lambda item: item[1].stamp_ns + (SWEEP_MS * MS if item[0] != "base" else 0))
+    return replace(front, items=tuple(items))
+
+
+def known_after(seconds: float, sources: frozenset[str]) -> NDArray[np.int8]:
+    """Cells around the start that are known then, these lasers being there."""
+    driving = two_lasers()
+    made = robot(driving.truth(0), config=TWO_LASERS)
+    made.play([i for i in driving.items if i[0] in sources | {"base"} and i[1].stamp_ns < seconds * 1e9])
+    return made.grid.patch().cells
+
+
+def test_two_lasers_draw_one_map() -> None:
+    driving = two_lasers()
+    made = robot(driving.truth(0), config=TWO_LASERS)
+    made.play(driving.items)
+    assert made.fusion.drops == {}
+    assert made.fusion.counters()["slam.scans_unordered"] == 0
+    walls = wall_errors_m(driving, made.grid.patch())
+    assert np.median(walls) <= 0.03
+    assert np.quantile(walls, 0.95) <= 0.08
+    assert np.quantile(pose_errors_m(driving, made.poses), 0.95) < 0.10
+    turned = [abs((p.map_from_base.inverse() @ driving.truth(p.stamp_ns)).yaw_rad) for p in made.poses]
+    assert np.quantile(turned, 0.95) < math.radians(1.0)  # a mount that is 3 degrees off fails here alone
+    mounts = {tuple(row) for row in np.round(made.localiser.slam.state().base_from_sensor, 6).tolist()}
+    assert mounts == {tuple(np.round((p.x_m, p.y_m, p.yaw_rad), 6).tolist()) for p in (MOUNT, REAR)}
+    front, rear, both = (
+        int(np.sum(known_after(1.5, frozenset(lasers)) >= 0)) for lasers in (["front"], ["rear"], ["front", "rear"])
+    )
+    assert both > 1.05 * max(front, rear)  # each sees what the other does not
+
+
+@pytest.mark.parametrize("lost", ["front", "rear"])
+def test_a_laser_that_is_lost_on_the_way_harms_nothing(lost: str) -> None:
+    driving = two_lasers()
+    half_ns = driving.items[-1][1].stamp_ns // 2
+    made = robot(driving.truth(0), config=TWO_LASERS)
+    made.play([i for i in driving.items if i[0] != lost or i[1].stamp_ns < half_ns])
+    assert made.fusion.drops == {}
+    assert made.fusion.troubles(0) == []
+    walls = wall_errors_m(driving, made.grid.patch())
+    assert np.median(walls) <= 0.03
+    assert np.quantile(walls, 0.95) <= 0.08
+    errors = pose_errors_m(driving, made.poses)
+    assert made.poses[-1].stamp_ns > 1.9 * half_ns
+    assert np.quantile(errors, 0.95) < 0.10
 
 
 # --- going on in a stored map
