@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -11,9 +12,11 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.scan import Scan
+from service import assemble
 from service.background import Submit, at_once
+from service.fusion import OdometryOnly
 from service.redraw import Redrawer
-from service.rpc import CallRefused
+from service.rpc import CallRefused, Calls
 from service.slam_live import SlamLocaliser
 
 F64 = NDArray[np.float64]
@@ -143,3 +146,14 @@ def test_what_names_no_closure_is_refused_in_words_and_changes_nothing(
     with pytest.raises(CallRefused, match=r"write|no such closure"):
         driver.localiser.undo(arguments)
     assert len(driver.localiser.slam.closures) == 3
+
+
+def test_the_calls_are_there_with_slam_alone_and_answer_in_json(driver: Driver) -> None:
+    calls = Calls("robots/x")
+    for name, handler in assemble.closure_calls(driver.localiser, lambda work: work()):
+        calls.register(name, handler)
+    assert calls.names == ["list_closures", "undo_closure"]
+    answer = json.loads(calls._call("undo_closure", b'{"number": 2}'))
+    assert [each["number"] for each in answer["undone"]] == [2]
+    assert len(json.loads(calls._call("list_closures", b""))["closures"]) == 2
+    assert list(assemble.closure_calls(OdometryOnly(Pose2(0.0, 0.0, 0.0)), lambda work: work())) == []
