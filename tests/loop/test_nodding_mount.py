@@ -76,12 +76,22 @@ def test_a_nodding_laser_shows_floor_and_walls(tmp_path: Path) -> None:
                 found = client.get(f"{BASE}/map/planes")
                 return json.loads(found[0].payload) if found else None
 
-            document = wait_for(
-                "planes with the floor among them", lambda: each if floor_of(each := planes()) else None
-            )
+            def upright_of(told: Any) -> list[Any]:
+                return [plane for plane in told["planes"] if abs(plane["normal"][2]) < 0.03]
+
+            def floor_and_walls() -> Any:
+                told = planes()
+                return told if floor_of(told) and len(upright_of(told)) >= 2 else None
+
+            document = wait_for("planes: the floor, and two walls that stand upright", floor_and_walls)
             cloud = decode_cloud(wait_for("a cloud", lambda: client.get(f"{BASE}/cloud/mast"))[0].payload)
-            found = wait_for("the ground", lambda: client.get(f"{BASE}/map/elevation"))
-            ground = json.loads(found[0].payload)
+
+            def elevation() -> Any:
+                found = client.get(f"{BASE}/map/elevation")
+                told = json.loads(found[0].payload) if found else None
+                return told if told and told["cells"]["traversable"] > 100 else None
+
+            ground = wait_for("a hundred cells of ground", elevation)
             heard = client.subscribe(f"{BASE}/sectors/polar/laser", ring=1)
 
             def sectors() -> Any:
@@ -94,10 +104,7 @@ def test_a_nodding_laser_shows_floor_and_walls(tmp_path: Path) -> None:
             health = json.loads(client.get(f"{BASE}/health/json")[0].payload)
         assert document["schema"] == "umfeld.planes.v1"
         assert {plane["mount"] for plane in document["planes"]} == {"mast"}
-        upright = [plane for plane in document["planes"] if abs(plane["normal"][2]) < 0.03]
-        assert len(upright) >= 2, "walls stand upright"
         assert ground["schema"] == "umfeld.elevation.v1"
-        assert ground["cells"]["traversable"] > 100
         level = [h for row in zip(ground["height_m"], ground["ground"]) for h, kind in zip(*row) if kind == 0]
         assert abs(float(np.median(level))) < 0.05  # ranges have 3 cm of noise, and most of it is seen at a low angle
         assert all(each["slope_rad"] is not None for each in told if each["traversable"])
