@@ -42,8 +42,8 @@ log = logging.getLogger(__name__)
 F64 = NDArray[np.float64]
 
 KEY = "map/graph"
-MATCH_M = 0.02
-MATCH_RAD = math.radians(1.0)
+MATCH_M = 0.05
+MATCH_RAD = math.radians(2.0)
 MATCH_NS = 250_000_000  # so often at least while it moves
 STILL_M = 1e-3
 STILL_RAD = 1e-3
