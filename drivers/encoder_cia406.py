@@ -21,6 +21,7 @@ Source: CiA 301 (NMT, SDO, PDO, heartbeat, emergency), CiA 406 (objects 6000h to
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -423,7 +424,7 @@ class _Track:
         return x0 + round((x1 - x0) * (stamp_ns - t0) / (t1 - t0))
 
 
-class _Cia406Conversation:
+class _Cia406Conversation(ABC):
     """Encoders that are read together; subclasses say what is made of a round of counts."""
 
     def __init__(
@@ -449,9 +450,9 @@ class _Cia406Conversation:
         ]
         self._restart(0)
 
+    @abstractmethod
     def _told(self, stamp_ns: int, totals: Sequence[int], continuous: bool) -> Reading:
         """The reading of one instant. totals: running counts, by node."""
-        raise NotImplementedError
 
     # ---- what a conversation shows
 
