@@ -36,6 +36,7 @@ from service.fusion import Fusion
 from service.outputs import HealthOut, Output, PoseOut
 from service.redraw import Redrawer
 from service.slam_live import SlamLocaliser
+from service.warm_up import warm_up
 from service.worker import Worker
 from sim_devices.floor_plan import load_floor_plan
 from sim_devices.robot import follow
@@ -113,7 +114,7 @@ def measure(seconds: float) -> dict[str, float]:
     """Play in real time; see the module's text."""
     sys.setswitchinterval(0.001)  # as the daemon does
     items = readings(seconds)
-    assemble.warm_up(CONFIG)
+    warm_up(CONFIG)
     beside_ns: list[int] = []
     background = Background()
 

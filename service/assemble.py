@@ -18,17 +18,10 @@ from drivers.conversation import Conversation
 from drivers.ports import Clock, Port, Tap
 from drivers.reader import Sink, WireReader
 from drivers.readings import (
-    AngleReading,
     ChainReading,
-    ContactLine,
     ContactReading,
-    ContactState,
     PoseReading,
-    RangeReading,
-    RangeStatus,
     Reading,
-    RingReading,
-    ScanReading,
     WheelReading,
 )
 from mapping.frames import Pose2, Pose3
@@ -65,7 +58,7 @@ from service.config_devices import (
     VescWheels,
     tcp_address,
 )
-from service.fusion import SECTOR_MEMORY_NS, Fusion, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer, StoredTile
+from service.fusion import SECTOR_MEMORY_NS, GridLayer, Localiser, OdometryOnly, Parts, SectorLayer, StoredTile
 from service.mounts import MountSettings, TiltingLaser
 from service.sensors import (
     AxleEncoder,
@@ -886,83 +879,3 @@ def _mavlink_sources(config: Config) -> list[tuple[str, str]]:
         for section, name, device in config.devices()
         if isinstance(device, MavlinkSonars | MavlinkWheels | MavlinkPose)
     ]
-
-
-# --- warming up -------------------------------------------------------------------------------------------------------
-
-
-def warm_up(config: Config) -> None:
-    """Load or compile every kernel this configuration uses, on maps that are thrown away."""
-    found = sensors(config)
-    names = {maker.name for maker in map_makers(config, found)}
-    if "lines" in names:
-        from mapping.lines.warm_up import warm_up as warm_up_lines
-
-        warm_up_lines()
-    if config.rings:
-        from mapping.topology.warm_up import warm_up as warm_up_topology
-
-        warm_up_topology()
-    if config.planes.enabled and config.mounts:
-        from mapping.planes.warm_up import warm_up as warm_up_planes
-
-        warm_up_planes()
-    if "elevation" in names:
-        from mapping.sectors.footprint import in_polygon
-
-        in_polygon(np.zeros((1, 2)), np.array(config.robot.footprint_m))
-    if "clearance" in names:
-        from mapping.grids.clearance import DistanceField
-
-        DistanceField(np.eye(3, dtype=np.bool_)).update([(0, 1), (0, 2)], [(0, 0), (1, 1)])
-    if "scenes" in names:
-        from mapping.features.warm_up import warm_up as warm_up_features
-
-        warm_up_features()
-    if config.rooms.enabled and config.grid.enabled:
-        from mapping.hybrid.warm_up import warm_up as warm_up_rooms
-
-        warm_up_rooms()
-    if config.localise.mode == "map":
-        from mapping.localise.warm_up import warm_up_in_map
-
-        warm_up_in_map()
-    elif config.slam.enabled and any(isinstance(sensor, Laser) for sensor in found.values()):
-        from mapping.grids.warm_up import warm_up as warm_up_grids
-        from mapping.localise.warm_up import warm_up as warm_up_slam
-
-        warm_up_slam()
-        warm_up_grids()
-    fusion = Fusion(parts(config, found, maps(config, found), OdometryOnly()))
-    now_ns = 0
-    for step in range(4):  # standing, then moving: the two take different kernels
-        now_ns += 100_000_000
-        for name, sensor in found.items():
-            fusion.on_item(name, _pretended(sensor, step, now_ns), now_ns)
-        for name, sensor in found.items():
-            if isinstance(sensor, Wheels):
-                fusion.on_item(name, WheelReading(now_ns + 50_000_000, 100 * step, -100 * step, True), now_ns)
-        fusion.tick(now_ns + 60_000_000)
-
-
-def _pretended(sensor: Sensor, step: int, now_ns: int) -> Reading:
-    match sensor:
-        case Laser():
-            bearing = np.linspace(-2.0, 2.0, 64)
-            distance = np.full(64, 2.0)
-            distance[:3] = (np.inf, -np.inf, np.nan)
-            return ScanReading(now_ns, 100_000.0 * (step % 2), 100_000_000, bearing, distance, 0.05, 10.0)
-        case Chain():
-            ranges = tuple(RangeReading(each.channel, 1.0, RangeStatus.ECHO) for each in sensor.transducers)
-            return ChainReading(now_ns, ranges)
-        case Wheels():
-            return WheelReading(now_ns, 100 * step, 100 * step, True)
-        case AxleEncoder():
-            return AngleReading(now_ns, 10 * step, step > 0)
-        case Contacts():
-            lines = tuple(ContactLine(each.line, ContactState.TRIPPED) for each in sensor.switches)
-            return ContactReading(now_ns, lines)
-        case PoseSource():
-            return PoseReading(now_ns, 0.1 * step, 0.0, 0.0, step > 0)
-        case Ring():
-            return RingReading(now_ns, np.full(24, 0.5), np.zeros(24, dtype=np.bool_), 0.1 * step, 0.0, step > 0)

@@ -162,6 +162,11 @@ def load(
     return Loaded(check(layers), layers.origins, layers.files)
 
 
+def from_document(document: Mapping[str, Any]) -> Config:
+    """A configuration that was checked before, from what its `model_dump_json()` says."""
+    return Config.model_validate(_tuples(document))
+
+
 def check(layers: Layers) -> Config:
     """Validate merged tables; raises WrongUsage with one line per fault."""
     data = _tuples(layers.data)

@@ -51,6 +51,7 @@ from service.sensors import Chain, Laser
 from service.store import MapStore, Provenance
 from service.systemd import Notifier
 from service.topo_maker import TopoMaker
+from service.warm_up import StoppedWhileCompiling, warm_up
 from service.worker import Worker
 from service.zenoh_session import NetworkSettings, TlsFiles
 
@@ -81,6 +82,7 @@ class Daemon:
         self._clean = True
         self._meter = health.ProcessMeter(self._clock.now_ns())
         self._mavlink: MavlinkOut | None = None
+        self._stop_asked: Callable[[], bool] = bool
         self._recorder = Recorder(recording_settings(self._config), clock=self._clock)
 
     # --- the life of the process
@@ -89,7 +91,12 @@ class Daemon:
         """Start, wait for SIGINT or SIGTERM, stop; returns the exit code. Trouble if it cannot start."""
         faulthandler.enable(file=sys.__stderr__ or sys.stderr)
         with _StopSignals() as asked:
-            self.start()
+            self._stop_asked = asked
+            try:
+                self.start()
+            except StoppedWhileCompiling:
+                log.info("stopped before the kernels were ready")
+                return 0
             try:
                 self._notifier.ready(self._summary())
                 log.info("%s", self._summary())
@@ -142,8 +149,7 @@ class Daemon:
         starting = _in_thread(
             "router", partial(self._publisher.start, announce=False)
         )  # takes half a second, the kernels as much
-        with _told_if_slow("compiling the kernels, as after each update: some 20 s"):
-            assemble.warm_up(config)
+        warm_up(config, stop_asked=self._stop_asked, meanwhile=self._notifier.still_starting)
         starting()
         makers = assemble.map_makers(config, self._sensors)
         self._makers = MapMakers(makers, self._publisher.offer, now_ns=self._clock.now_ns)
@@ -523,6 +529,10 @@ class _StopSignals:
         os.close(self._reading)
         os.close(self._writing)
 
+    def __call__(self) -> bool:
+        """Whether stopping was asked for."""
+        return self._count > 0
+
     def wait(self, timeout_s: float) -> bool:
         """Whether stopping was asked for, waiting for it."""
         if self._count == 0:
@@ -533,18 +543,6 @@ class _StopSignals:
         self._count += 1
         if self._count > 1:
             os._exit(128 + number)
-
-
-@contextlib.contextmanager
-def _told_if_slow(text: str, after_s: float = 2.0) -> Iterator[None]:
-    """One log line if what is done takes long."""
-    timer = threading.Timer(after_s, log.info, (text,))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 @contextlib.contextmanager

@@ -30,6 +30,10 @@ class Notifier:
         """Start-up is over."""
         self._send(f"READY=1\nSTATUS={status}")
 
+    def still_starting(self, status: str) -> None:
+        """Start-up goes on and deserves another half minute."""
+        self._send(f"EXTEND_TIMEOUT_USEC=30000000\nSTATUS={status}")
+
     def stopping(self, status: str) -> None:
         """The way out has begun."""
         self._send(f"STOPPING=1\nSTATUS={status}")

@@ -296,7 +296,8 @@ class Client:
             return bases[0]
         if not bases:
             raise NoDaemon(f"no daemon is alive at {self.endpoint}: start one with `umfeld run`")
-        raise NoDaemon(f"several robots answer at {self.endpoint}: choose one with --base ({', '.join(bases)})")
+        names = ", ".join(found.removeprefix("robots/") for found in bases)
+        raise NoDaemon(f"several robots answer at {self.endpoint}: choose one with --robot ({names})")
 
     def get(self, selector: str, *, timeout_s: float = 2.0) -> list[Received]:
         """Last values of the keys that match, e.g. `robots/r1/map/**` or `robots/r1/map/grid?format=png`."""

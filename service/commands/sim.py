@@ -15,7 +15,10 @@ app = typer.Typer()
 @app.command()
 def sim(
     *,
-    preset: Annotated[str | None, typer.Option(help="The robot: artos (the default).")] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="The robot: artos (the default), two_wheeler, nodding, alice, roboclaw, odrive, autopilot."),
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="Emulate the devices of this configuration instead.")] = None,
     world: Annotated[
         str | None, typer.Option(help="Floor plan: flat (the default), hall, loop, office, ... or a .toml file.")

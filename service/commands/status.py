@@ -15,6 +15,7 @@ from service.errors import Trouble
 
 app = typer.Typer()
 
+_REPLACED = "not_sent."
 _LEVEL_COLOURS = {"ok": "green", "warning": "yellow", "error": "red", "stale": "magenta"}
 
 
@@ -75,9 +76,11 @@ def _print(document: Mapping[str, Any]) -> None:
     rows = [("device", "kind", "state", "rate", "age", "drops", "identity")]
     rows += [_row(source) for source in document["sources"]]
     print_table(rows, [None, *(_LEVEL_COLOURS.get(source["level"]) for source in document["sources"])])
-    lost = {name: count for name, count in document["counters"].items() if count and _is_loss(name)}
-    if lost:
-        typer.echo("lost     " + ", ".join(f"{name} {count}" for name, count in sorted(lost.items())))
+    counters = {name: count for name, count in sorted(document["counters"].items()) if count}
+    if lost := [f"{name} {count}" for name, count in counters.items() if _is_loss(name)]:
+        typer.echo("lost     " + ", ".join(lost))
+    if newer := [f"{name.partition(_REPLACED)[2]} {count}" for name, count in counters.items() if _REPLACED in name]:
+        typer.echo("replaced by newer values before they were sent: " + ", ".join(newer))
 
 
 def _row(source: Mapping[str, Any]) -> tuple[str, str, str, str, str, str, str]:
@@ -95,6 +98,8 @@ def _row(source: Mapping[str, Any]) -> tuple[str, str, str, str, str, str, str]:
 
 
 def _is_loss(name: str) -> bool:
+    if _REPLACED in name:
+        return False
     return any(word in name for word in ("drop", "not_sent", "refused", "failed", "errors", "lost"))
 
 

@@ -29,6 +29,7 @@ from service import assemble
 from service.config import Config, load
 from service.fusion import Fusion, OdometryOnly
 from service.outputs import HealthOut, OdomOut, Output, PolarOut
+from service.warm_up import warm_up
 from service.worker import Worker
 from sim_devices.attach import Attachment, Link, PtyLink
 from sim_devices.device import F64, Frame, Mount
@@ -122,7 +123,7 @@ class Rig:
         path.write_text(to_toml(table))
         self.config: Config = load(path, environment={}).config
         self.sensors = assemble.sensors(self.config)
-        assemble.warm_up(self.config)
+        warm_up(self.config)
         made = assemble.maps(self.config, self.sensors)
         fusion = Fusion(assemble.parts(self.config, self.sensors, made, OdometryOnly()))
         self.worker = Worker(

@@ -17,6 +17,7 @@ from service.config import Config, load
 from service.fusion import Fusion, OdometryOnly
 from service.outputs import GridOut, PolarOut, RectOut
 from service.sensors import Chain, Laser, Wheels
+from service.warm_up import warm_up
 
 ROBOT = """
 [robot]
@@ -165,5 +166,5 @@ def test_the_whole_robot_draws_and_tells(config: Config) -> None:
 
 
 def test_warming_up_leaves_no_trace_and_reaches_every_map(config: Config) -> None:
-    assemble.warm_up(config)
-    assemble.warm_up(Config.model_validate({}))
+    warm_up(config)
+    warm_up(Config.model_validate({}))

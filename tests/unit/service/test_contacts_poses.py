@@ -19,6 +19,7 @@ from service.fusion import Fusion, Parts, Touch
 from service.layers import insert_touch
 from service.outputs import OdomOut
 from service.sensors import Contacts, PoseSource, Switch
+from service.warm_up import warm_up
 from sim_devices.presets import Table
 
 SECOND = 1_000_000_000
@@ -50,7 +51,7 @@ def test_switches_share_the_board_and_feed_maps(tmp_path: Path) -> None:
     made = assemble.maps(config, found)
     assert [layer.sources for layer in made.sectors] == [frozenset({"bumpers"})]
     assert all("bumpers" in grid.sources for grid in made.grids)
-    assemble.warm_up(config)
+    warm_up(config)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,259 @@
+"""Kernels ready before the first reading: loaded from numba's cache, or else compiled by processes beside this one.
+
+After each update compiling takes a minute of processor time. Two processes share it; this one stays as small as with
+a warm cache (a compiler keeps some 250 MB) and can be told to stop meanwhile.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import numpy as np
+from numba.core import event
+
+from drivers.readings import (
+    AngleReading,
+    ChainReading,
+    ContactLine,
+    ContactReading,
+    ContactState,
+    PoseReading,
+    RangeReading,
+    RangeStatus,
+    Reading,
+    RingReading,
+    ScanReading,
+    WheelReading,
+)
+from service import assemble
+from service.config import Config, from_document
+from service.fusion import Fusion, OdometryOnly
+from service.sensors import AxleEncoder, Chain, Contacts, Laser, PoseSource, Ring, Sensor, Wheels
+
+_LOG = logging.getLogger(__name__)
+
+_POLL_S = 0.2
+_COMPILERS = 2
+Step = Callable[[], None]
+Meanwhile = Callable[[str], None]
+
+
+class StoppedWhileCompiling(Exception):  # noqa: N818 - no error: somebody asked for it
+    """Stopping was asked for before the kernels were ready."""
+
+
+def warm_up(config: Config, *, stop_asked: Callable[[], bool] = bool, meanwhile: Meanwhile | None = None) -> None:
+    """Load or compile every kernel this configuration uses, on maps that are thrown away.
+
+    meanwhile: called every fifth of a second while others compile, with what is going on.
+    Raises StoppedWhileCompiling soon after stop_asked() is true.
+    """
+    steps, asked_others = _steps(config), False
+    for count, step in enumerate(list(steps.values()), start=1):
+        with _compilations() as compiled:
+            step()
+        if compiled and not asked_others:  # the cache is cold
+            asked_others = True
+            _compile_beside(config, list(steps)[count:], stop_asked, meanwhile)
+
+
+def _steps(config: Config) -> dict[str, Step]:
+    """What there is to warm up, by name; the small ones first: the first tells whether the cache is cold."""
+    found = assemble.sensors(config)
+    names = {maker.name for maker in assemble.map_makers(config, found)}
+    steps: dict[str, Step] = {"footprint": lambda: _footprint(config), "clearance": _clearance}
+    if "lines" in names:
+        from mapping.lines.warm_up import warm_up as warm_up_lines
+
+        steps["lines"] = warm_up_lines
+    if config.rings:
+        from mapping.topology.warm_up import warm_up as warm_up_topology
+
+        steps["topology"] = warm_up_topology
+    if config.planes.enabled and config.mounts:
+        from mapping.planes.warm_up import warm_up as warm_up_planes
+
+        steps["planes"] = warm_up_planes
+    if "scenes" in names:
+        from mapping.features.warm_up import warm_up as warm_up_features
+
+        steps["features"] = warm_up_features
+    if config.rooms.enabled and config.grid.enabled:
+        from mapping.hybrid.warm_up import warm_up as warm_up_rooms
+
+        steps["rooms"] = warm_up_rooms
+    if config.localise.mode == "map":
+        from mapping.localise.warm_up import warm_up_in_map
+
+        steps["localise"] = warm_up_in_map
+    elif config.slam.enabled and any(isinstance(sensor, Laser) for sensor in found.values()):
+        from mapping.grids.warm_up import warm_up as warm_up_grids
+        from mapping.localise.warm_up import warm_up as warm_up_slam
+
+        steps["slam"] = warm_up_slam
+        steps["grids"] = warm_up_grids
+    steps["fusion"] = lambda: _fusion(config, found)
+    return steps
+
+
+# --- compiling beside this process ------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _compilations() -> Iterator[list[str]]:
+    """Names of the kernels that are compiled, not loaded, while the block runs."""
+
+    class Listener(event.Listener):
+        def on_start(self, event: Any) -> None:
+            names.append(str(event.data["dispatcher"]))
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    names: list[str] = []
+    listener = Listener()
+    event.register("numba:compile", listener)  # type: ignore[no-untyped-call]
+    try:
+        yield names
+    finally:
+        event.unregister("numba:compile", listener)  # type: ignore[no-untyped-call]
+
+
+def _compile_beside(
+    config: Config, names: list[str], stop_asked: Callable[[], bool], meanwhile: Meanwhile | None
+) -> None:
+    """Fill the cache by other processes; what they fail to compile is left to the one who needs it."""
+    begun_s = time.monotonic()
+    _LOG.info("compiling the kernels, as after each update: about a minute on one slow core")
+    todo = names[::-1]  # the large ones first
+    compilers = [_Compiler(config, todo) for _ in range(min(_COMPILERS, len(names), os.cpu_count() or 1))]
+    try:
+        while any(each.is_busy() for each in compilers):
+            if stop_asked():
+                raise StoppedWhileCompiling
+            if meanwhile is not None:
+                meanwhile(f"compiling the kernels: {len(names) - len(todo)} of {len(names)} parts begun")
+            for each in compilers:
+                each.wait(_POLL_S / len(compilers))
+    finally:
+        for each in compilers:
+            each.close()
+    _LOG.info("kernels compiled in %.0f s", time.monotonic() - begun_s)
+
+
+class _Compiler:
+    """A process that compiles what it is told, and the thread that tells it. todo: shared; taken from the front."""
+
+    def __init__(self, config: Config, todo: list[str]) -> None:
+        self._todo = todo
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "service.warm_up"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,  # a terminal's Ctrl-C reaches us; it ends when its input does
+        )
+        self._thread = threading.Thread(target=self._tell, args=(config,), name="compile", daemon=True)
+        self._thread.start()
+
+    def _tell(self, config: Config) -> None:
+        told, answers = self._process.stdin, self._process.stdout
+        assert told is not None
+        assert answers is not None
+        with suppress(OSError, IndexError, ValueError):  # it died or was closed; or nothing is left to do
+            print(config.model_dump_json(), file=told, flush=True)
+            while True:
+                print(self._todo.pop(0), file=told, flush=True)
+                if not answers.readline():
+                    return
+
+    def is_busy(self) -> bool:
+        """Whether there is something left for it."""
+        return self._thread.is_alive()
+
+    def wait(self, timeout_s: float) -> None:
+        """Until nothing is left for it, or so long."""
+        self._thread.join(timeout_s)
+
+    def close(self) -> None:
+        """End the process, whatever it does."""
+        self._process.kill()
+        self._process.wait()
+        self._thread.join()
+        for stream in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):
+                assert stream is not None
+                stream.close()
+
+
+def _main() -> None:
+    """Compile the parts named on standard input, one a line after the configuration; an empty line back for each."""
+    steps = _steps(from_document(json.loads(sys.stdin.readline())))
+    for line in sys.stdin:
+        steps[line.strip()]()
+        print(flush=True)
+
+
+# --- the parts --------------------------------------------------------------------------------------------------------
+
+
+def _clearance() -> None:
+    from mapping.grids.clearance import DistanceField
+
+    DistanceField(np.eye(3, dtype=np.bool_)).update([(0, 1), (0, 2)], [(0, 0), (1, 1)])
+
+
+def _footprint(config: Config) -> None:
+    from mapping.sectors.footprint import in_polygon
+
+    in_polygon(np.zeros((1, 2)), np.array(config.robot.footprint_m))
+
+
+def _fusion(config: Config, found: dict[str, Sensor]) -> None:
+    fusion = Fusion(assemble.parts(config, found, assemble.maps(config, found), OdometryOnly()))
+    now_ns = 0
+    for step in range(4):  # standing, then moving: the two take different kernels
+        now_ns += 100_000_000
+        for name, sensor in found.items():
+            fusion.on_item(name, _pretended(sensor, step, now_ns), now_ns)
+        for name, sensor in found.items():
+            if isinstance(sensor, Wheels):
+                fusion.on_item(name, WheelReading(now_ns + 50_000_000, 100 * step, -100 * step, True), now_ns)
+        fusion.tick(now_ns + 60_000_000)
+
+
+def _pretended(sensor: Sensor, step: int, now_ns: int) -> Reading:
+    match sensor:
+        case Laser():
+            bearing = np.linspace(-2.0, 2.0, 64)
+            distance = np.full(64, 2.0)
+            distance[:3] = (np.inf, -np.inf, np.nan)
+            return ScanReading(now_ns, 100_000.0 * (step % 2), 100_000_000, bearing, distance, 0.05, 10.0)
+        case Chain():
+            ranges = tuple(RangeReading(each.channel, 1.0, RangeStatus.ECHO) for each in sensor.transducers)
+            return ChainReading(now_ns, ranges)
+        case Wheels():
+            return WheelReading(now_ns, 100 * step, 100 * step, True)
+        case AxleEncoder():
+            return AngleReading(now_ns, 10 * step, step > 0)
+        case Contacts():
+            lines = tuple(ContactLine(each.line, ContactState.TRIPPED) for each in sensor.switches)
+            return ContactReading(now_ns, lines)
+        case PoseSource():
+            return PoseReading(now_ns, 0.1 * step, 0.0, 0.0, step > 0)
+        case Ring():
+            return RingReading(now_ns, np.full(24, 0.5), np.zeros(24, dtype=np.bool_), 0.1 * step, 0.0, step > 0)
+
+
+if __name__ == "__main__":
+    _main()
