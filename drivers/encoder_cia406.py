@@ -41,6 +41,7 @@ _DEVICE_PROFILE = 406
 _POSITION_MAPPING = 0x60040020
 _PDO_DISABLED = 1 << 31
 _FULL_RANGE = 1 << 32
+_TELLS_FULL_RANGE = (0, _FULL_RANGE - 1)  # 6002h has 32 bits, in which 2^32 cannot be said
 
 _HEARTBEAT_MS = 100
 # Missing readings are noticed after 200 ms. A node is given up, and with it the run of its count, only after five
@@ -301,7 +302,9 @@ class _Node:
         self.refusal = None
         self.identity = yield from _ask_identity()
         steps_per_turn = (yield from _number(Upload(0x6001))) or _UNKNOWN_STEPS
-        range_ticks = (yield from _number(Upload(0x6002))) or _FULL_RANGE
+        range_ticks = yield from _number(Upload(0x6002))
+        if range_ticks in _TELLS_FULL_RANGE:
+            range_ticks = _FULL_RANGE
         self.unwrapper.configure(range_ticks, steps_per_turn)
         self._beats = yield from _set_heartbeat()  # without one, missing readings tell that it is gone
         if self.cyclic:

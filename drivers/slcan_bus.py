@@ -81,7 +81,7 @@ class LawicelBus(can.BusABC):
         self._buffer = bytearray()
         self._frames: deque[can.Message] = deque()
         self._refusals = 0
-        self._answered = False  # refusals before anything else are to closing what was not open
+        self._answered = False  # before the first frame came or was taken, a refusal is to closing what was not open
         self._line.discard_input()
         # Empty lines end whatever the adapter had half received; it may be open still, so close it first.
         self._line.write(f"\r\r\rC\r{_RATE_COMMANDS[bitrate_bps]}\rO\r".encode())
@@ -132,7 +132,7 @@ class LawicelBus(can.BusABC):
             return
         if line in (b"", b"z", b"Z"):
             self._refusals = 0
-            self._answered = True
+            self._answered = self._answered or line != b""  # empty lines are answered by a closed adapter, too
             return
         frame = decode_line(line)
         if frame is None:

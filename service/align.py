@@ -51,7 +51,7 @@ class WaitingRoom(Generic[T]):
 
     limit_ns: longest wait.  capacity: most values at once; the oldest leave first when it is full.
     Drop reasons: `odometry_late` waited too long, `odometry_gone` poses that old are no longer known,
-    `waiting_full` too many wait.
+    `before_odometry` measured before there was any pose, `waiting_full` too many wait.
     """
 
     def __init__(self, *, limit_ns: int, capacity: int = 256) -> None:
@@ -80,8 +80,10 @@ class WaitingRoom(Generic[T]):
             dropped.append((ticket.source, "waiting_full"))
         return dropped
 
-    def release(self, *, oldest_ns: int | None, newest_ns: int | None, now_ns: int) -> Released[T]:
-        """Let go what poses cover by now, and what waited too long."""
+    def release(
+        self, *, oldest_ns: int | None, newest_ns: int | None, now_ns: int, begun_ns: int | None = None
+    ) -> Released[T]:
+        """Let go what poses cover by now, and what waited too long. begun_ns: the very first pose, if there was one."""
         ready: list[tuple[str, T]] = []
         dropped: list[tuple[str, str]] = []
         staying: list[_Ticket] = []
@@ -93,7 +95,10 @@ class WaitingRoom(Generic[T]):
             value = self._values.pop(ticket.number)
             if covered is Cover.COVERED:
                 ready.append((ticket.source, value))
+            elif covered is Cover.NOT_YET:
+                dropped.append((ticket.source, "odometry_late"))
             else:
-                dropped.append((ticket.source, "odometry_gone" if covered is Cover.GONE else "odometry_late"))
+                is_early = begun_ns is not None and ticket.first_ns < begun_ns
+                dropped.append((ticket.source, "before_odometry" if is_early else "odometry_gone"))
         self._tickets = staying
         return Released(ready, dropped)

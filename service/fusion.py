@@ -12,7 +12,8 @@ Input never stops fusion. What cannot be used is dropped and counted by source a
     stamp_equal, stamp_backward, stamp_ahead    not newer than the source's last, or from the future
     wrong_count, no_beams, too_many_beams, bearing_not_finite, times_wrong, limits_wrong    a scan that is none
     range_out_of_bounds    single beams: not positive, or beyond the device's limit; taken as INVALID
-    odometry_late, odometry_gone, odometry_broken, waiting_full    a scan that no pose belongs to, for the grids only
+    odometry_late, odometry_gone, odometry_broken, waiting_full    a scan that no pose belongs to, for the grids only;
+        what was measured while odometry was starting is not counted: the map begins with the first pose
     map_refused    a place or a length that a grid cannot hold
     too_fast, not_a_pose    wheel counts that no wheel can have made, poses nobody can have gone to
     unconfirmed    a sonar's range much farther than its last, by a protocol without a check sum: the next decides
@@ -314,6 +315,7 @@ class Fusion:
         self._too_fast = 0
         self._broken = False
         self._state: OdometryState | None = None
+        self._begun_ns: int | None = None  # the first pose
         self._pose_told_ns: int | None = None
         self._fresh_until_ns: dict[str, int] = {}
         self._sectors_told_ns: dict[int, int] = {}
@@ -609,6 +611,8 @@ class Fusion:
 
     def _take_state(self, state: OdometryState) -> list[Output]:
         self._state = state
+        if self._begun_ns is None:
+            self._begun_ns = state.stamp_ns
         self._poses.add(state.stamp_ns, state.odom_from_base, after_break=state.broken)
         self._parts.localiser.take_odometry(state)
         outputs: list[Output] = [
@@ -662,10 +666,14 @@ class Fusion:
             released = self._waiting.release(oldest_ns=-_FOREVER_NS, newest_ns=_FOREVER_NS, now_ns=now_ns)
         else:
             released = self._waiting.release(
-                oldest_ns=self._poses.oldest_ns, newest_ns=self._poses.newest_ns, now_ns=now_ns
+                oldest_ns=self._poses.oldest_ns,
+                newest_ns=self._poses.newest_ns,
+                now_ns=now_ns,
+                begun_ns=self._begun_ns,
             )
         for source, reason in released.dropped:
-            self._drop(source, reason)
+            if reason != "before_odometry":
+                self._drop(source, reason)
             if reason == "odometry_late":
                 self._late_since_ns = self._late_since_ns or now_ns
         if released.ready:

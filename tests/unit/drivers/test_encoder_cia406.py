@@ -151,7 +151,8 @@ class Bench:
             readings += self.say(*[answer for answer in answers if not self.lost(answer)])
             self.now_ns += MS // 2
             for node, step in zip(self.nodes, move):
-                node.position = (node.position + step) % int.from_bytes(node.objects[0x6002, 0], "little")
+                told = int.from_bytes(node.objects[0x6002, 0], "little")
+                node.position = (node.position + step) % (1 << 32 if told in (0, 0xFFFFFFFF) else told)
         return [reading for reading in readings if isinstance(reading, WheelReading)]
 
     def state(self) -> LinkState:
@@ -500,6 +501,19 @@ def test_wrap_both_ways_through_the_range_of_the_device() -> None:
     assert all(reading.continuous for reading in readings)
     assert {b.left_ticks - a.left_ticks for a, b in pairwise(readings)} == {30}
     assert {b.right_ticks - a.right_ticks for a, b in pairwise(readings)} == {-30}
+
+
+@pytest.mark.parametrize("told", [0, 0xFFFFFFFF])
+def test_a_range_that_needs_33_bits_is_told_by_its_largest_number_or_none(told: int) -> None:
+    """A wheel that starts at 0 and rolls back counts FFFFFFFFh at once, as the mirrored one of each robot does."""
+    bench = Bench()
+    for node in bench.nodes:
+        node.objects[0x6002, 0] = number(told, 4)
+    bench.run(60)
+    readings = bench.run(200, move=(-1, 1)) + bench.run(400, move=(1, -1))
+    assert all(abs(b.left_ticks - a.left_ticks) <= 10 for a, b in pairwise(readings)), "no jump at either wrap"
+    assert all(reading.continuous for reading in readings)
+    assert bench.pair.counters.drops == {}
 
 
 def test_one_node_missing_is_named() -> None:

@@ -364,6 +364,18 @@ def test_slcan_adapter_that_refuses_everything_is_reopened(pty: Pty) -> None:
     port.close()
 
 
+def test_slcan_refusal_to_close_what_was_not_open_is_no_drop(pty: Pty) -> None:
+    """The answers of the emulated adapter to the opening sequence, frames it has queued right behind."""
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    pty.send(b"\r\r\r\a\r\rz\rt1230\r")
+    assert len(read_frames(port, 1)) == 1
+    assert port.drops == {}
+    pty.send(b"\at1230\r")
+    assert len(read_frames(port, 1)) == 1
+    assert port.drops == {"slcan_refused": 1}
+    port.close()
+
+
 def test_slcan_unplugged_is_noticed_in_time(pty: Pty) -> None:
     port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
     threading.Timer(0.1, pty.unplug).start()

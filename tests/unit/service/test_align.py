@@ -53,6 +53,14 @@ def test_what_is_older_than_all_poses_is_dropped_at_once() -> None:
     assert (released.ready, released.dropped) == ([], [("a", "odometry_gone")])
 
 
+def test_what_was_measured_before_there_was_any_pose_is_told_apart() -> None:
+    room: WaitingRoom[str] = WaitingRoom(limit_ns=500)
+    room.put("a", "x", 10, 20, now_ns=0)
+    room.put("b", "y", 14, 20, now_ns=0)
+    released = room.release(oldest_ns=15, newest_ns=30, now_ns=1, begun_ns=12)
+    assert released.dropped == [("a", "before_odometry"), ("b", "odometry_gone")]
+
+
 def test_the_oldest_leaves_a_full_room() -> None:
     room: WaitingRoom[int] = WaitingRoom(limit_ns=500, capacity=2)
     assert room.put("a", 1, 10, 10, now_ns=0) == []
