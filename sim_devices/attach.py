@@ -32,6 +32,8 @@ from sim_devices.device import ByteDevice
 TCGETS2 = 0x802C542A
 TERMIOS2 = struct.Struct("4IB19s2I")  # flags, line discipline, control characters, input and output speed
 READ_SIZE = 65536
+MOST_OWED = 65536
+OWED_NS = 250_000_000
 HOKUYO_TCP_PORT = 10940
 IDLE_NS = 50_000_000  # longest sleep
 STEP_NS = 2_000_000  # step of a device that does not say when it wants the next one
@@ -386,6 +388,9 @@ class DeviceStation:
     A device with an attribute `plugged` (a fault wrapper) pulls its own wire by setting it False, with `port_suffix` it
     renames its pty, with `port_busy` and `port_denied` it keeps others out; one with `next_ns` is served when it asks
     for it; one with `link_lost(now_ns)` is told when its TCP host went away.
+
+    A pty holds less than what the kernel holds for a real port (64 KiB), so as much waits here for a host that is
+    busy; where nothing at all was taken for 0.25 s nobody reads, and what comes is lost, as on a port that is not open.
     """
 
     def __init__(self, device: ByteDevice, link: Link) -> None:
@@ -394,6 +399,8 @@ class DeviceStation:
         self._wanted = True
         self._hosts_lost = 0
         self._port = PortOf(link)
+        self._owed = b""
+        self._moved_ns = 0  # when the link last took something
 
     def files(self) -> list[int]:
         return self.link.files()
@@ -406,17 +413,31 @@ class DeviceStation:
         received = self.link.read() if self.link.is_open else b""
         self._tell_loss(now_ns)
         sent = self.device.step(now_ns, received, self.link.baud)
-        self._follow_plug()
-        if sent:
-            self.link.write(sent)
+        if self._follow_plug():
+            self._owed = b""
+        self._hand_over(sent, now_ns)
         due_ns: int | None = getattr(self.device, "next_ns", now_ns + STEP_NS)
+        if self._owed:
+            due_ns = now_ns + STEP_NS if due_ns is None else min(due_ns, now_ns + STEP_NS)
         return due_ns
+
+    def _hand_over(self, sent: bytes, now_ns: int) -> None:
+        """Give the link what it takes, and keep the rest for a host that was busy for a moment."""
+        data = self._owed + sent
+        if not data:
+            return
+        taken = self.link.write(data)
+        if taken:
+            self._moved_ns = now_ns
+        is_read = now_ns - self._moved_ns <= OWED_NS and self.link.is_open
+        self._owed = data[taken : taken + MOST_OWED] if is_read else b""
+        self.link.counters.dropped_bytes -= len(self._owed)
 
     def close(self) -> None:
         self.link.close()
 
-    def _follow_plug(self) -> None:
-        self._port.follow(self.device, self._wanted)
+    def _follow_plug(self) -> bool:
+        return self._port.follow(self.device, self._wanted)
 
     def _tell_loss(self, now_ns: int) -> None:
         lost = int(getattr(self.link, "hosts_lost", 0))

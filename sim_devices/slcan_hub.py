@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from sim_devices.attach import STEP_NS, Link, PortOf
+from sim_devices.attach import MOST_OWED, OWED_NS, STEP_NS, Link, PortOf
 from sim_devices.device import ByteDevice, CanDevice, Frame
 from sim_devices.wire import SECOND_NS
 
@@ -342,7 +342,8 @@ class CanBusStation:
 
     def _due_ns(self, now_ns: int) -> int | None:
         silent = any(not hasattr(node, "next_ns") for node in self.bus.nodes.values())
-        due = [now_ns + STEP_NS] if silent else []
+        owing = any(member.owes for member in self._members.values())
+        due = [now_ns + STEP_NS] if silent or owing else []
         for device in (self.bus, *(member.device for member in self._members.values())):
             at_ns: int | None = getattr(device, "next_ns", None)
             if at_ns is not None:
@@ -361,6 +362,12 @@ class _Member:
         self._port = PortOf(link)
         self._rest = b""
         self._out = b""
+        self._moved_ns = 0  # when the link last took something
+
+    @property
+    def owes(self) -> bool:
+        """Whether the link could not take all yet."""
+        return bool(self._rest)
 
     def take(self, now_ns: int) -> None:
         """Hear the host."""
@@ -376,10 +383,17 @@ class _Member:
         if not self._out and not self._rest:
             return
         data = self._rest + self._out
-        rest = data[self.link.write(data) :]
-        line_end = _end_of_line(rest) if len(rest) < len(data) or self._rest else 0
-        self._rest = rest[:line_end]
-        if lost := rest[line_end:]:
+        taken = self.link.write(data)
+        rest = data[taken:]
+        if taken:
+            self._moved_ns = now_ns
+        if now_ns - self._moved_ns <= OWED_NS:  # the host is busy for a moment: see attach.DeviceStation
+            kept = _end_of_line(rest, MOST_OWED)
+        else:
+            kept = _end_of_line(rest) if taken or self._rest else 0
+        self._rest = rest[:kept]
+        self.link.counters.dropped_bytes -= kept
+        if lost := rest[kept:]:
             self.adapter.note_overrun(lost.count(CR) + lost.count(BEL))
 
     def _follow_plug(self, now_ns: int) -> None:
@@ -388,7 +402,11 @@ class _Member:
             self._rest = self._out = b""
 
 
-def _end_of_line(data: bytes) -> int:
-    """Length of the first line of data, its end included."""
+def _end_of_line(data: bytes, most: int = 0) -> int:
+    """Length of the whole lines at the beginning of data, ends included: of `most` bytes, or else of the first."""
+    if len(data) <= most:
+        return len(data)
+    if most and (end := max(data.rfind(CR, 0, most), data.rfind(BEL, 0, most))) >= 0:
+        return end + 1
     ends: Sequence[int] = [end for end in (data.find(CR), data.find(BEL)) if end >= 0]
     return min(ends) + 1 if ends else len(data)

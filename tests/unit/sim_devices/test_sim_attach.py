@@ -77,6 +77,47 @@ def test_full_queue_drops_and_counts(tmp_path: Path) -> None:
     link.close()
 
 
+class Talker:
+    """A device that sends 1000 numbered bytes at each step while it is told to."""
+
+    def __init__(self) -> None:
+        self.talks = True
+        self.sent = bytearray()
+        self.next_ns: int | None = None
+
+    def step(self, now_ns: int, received: bytes, baud: int | None = None) -> bytes:
+        out = bytes(i % 251 for i in range(len(self.sent), len(self.sent) + 1000)) if self.talks else b""
+        self.sent += out
+        return out
+
+
+def test_a_host_that_is_busy_for_a_moment_loses_nothing(tmp_path: Path) -> None:
+    """What a kernel holds for a real port is more than a pty takes."""
+    device, link, loop = Talker(), PtyLink(tmp_path / "p"), Attachment()
+    loop.add("talker", device, link)
+    with serial.Serial(str(link.path), 115200, timeout=0) as host:
+        for step in range(40):
+            loop.service(step * 5_000_000)
+        device.talks = False
+        heard = bytearray()
+        for step in range(40, 100):
+            loop.service(step * 5_000_000)
+            heard += host.read(65536)
+        assert heard == device.sent
+        assert link.counters.dropped_bytes == 0
+    loop.stop()
+
+
+def test_what_nobody_reads_is_lost(tmp_path: Path) -> None:
+    device, link, loop = Talker(), PtyLink(tmp_path / "p"), Attachment()
+    loop.add("talker", device, link)
+    for step in range(100):
+        loop.service(step * 5_000_000)
+    assert link.counters.sent_bytes + link.counters.dropped_bytes == len(device.sent)
+    assert link.counters.dropped_bytes > 50_000
+    loop.stop()
+
+
 def test_replug_is_a_new_terminal_under_the_old_name(tmp_path: Path) -> None:
     link = PtyLink(tmp_path / "p")
     host = serial.Serial(str(link.path), timeout=0.2)

@@ -162,15 +162,33 @@ def test_endless_line_is_refused_once_and_forgotten() -> None:
     assert bench.tell("a", b"V\r") == b"V1013\r"
 
 
+class Narrow(MemoryLink):
+    """A link that takes `room` bytes more."""
+
+    room = 25
+
+    def write(self, data: bytes) -> int:
+        taken = super().write(data[: self.room])
+        self.room -= taken
+        return taken
+
+
+def test_a_host_that_is_busy_for_a_moment_loses_nothing() -> None:
+    bench = Bench("a")
+    narrow = Narrow()
+    adapter = bench.station.add_member("narrow", narrow)
+    adapter.step(0, b"O\r")
+    for number in range(10):
+        bench.bus.send(None, Frame(0x100 + number, b"\x11"))
+        bench.hear("a")
+    bench.now_ns += 200 * MS
+    narrow.room = 1000
+    bench.hear("a")
+    assert narrow.host_read() == b"".join(b"t%03X111\r" % (0x100 + number) for number in range(10))
+    assert adapter.counters.dropped_lines == 0
+
+
 def test_full_queue_loses_whole_lines_and_counts_them() -> None:
-    class Narrow(MemoryLink):
-        room = 25
-
-        def write(self, data: bytes) -> int:
-            taken = super().write(data[: self.room])
-            self.room -= taken
-            return taken
-
     bench = Bench("a")
     narrow = Narrow()
     adapter = bench.station.add_member("narrow", narrow)
@@ -178,6 +196,8 @@ def test_full_queue_loses_whole_lines_and_counts_them() -> None:
     narrow.room = 25
     for number in range(10):
         bench.bus.send(None, Frame(0x100 + number, b"\x11"))
+    bench.hear("a")
+    bench.now_ns += 300 * MS  # nobody reads
     bench.hear("a")
     narrow.room = 1000
     bench.bus.send(None, Frame(0x200, b"\x22"))
