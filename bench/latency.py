@@ -223,7 +223,7 @@ def measure(seconds: float) -> list[Figure]:
         run = [*umfeld, "run", "--config", str(config), *(f"--set={each}" for each in settings)]
         listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
         listener.bind(str(folder / "notify"))
-        listener.settimeout(30.0)
+        listener.settimeout(120.0)  # the first start compiles
         tell = {"NOTIFY_SOCKET": str(folder / "notify")}
         with process(*run, environment=tell):  # compiles what is not compiled yet
             ready_s(listener, time.monotonic())

@@ -573,7 +573,7 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         seen_by = [each for each in found.values() if isinstance(each, Laser) and each.name in fed_by]
         mounts = {each.name: each.base_from_sensor for each in seen_by}
         makers.append(SceneMaker(mounts, most=config.scenes.most, period_ns=round(config.scenes.period_s * 1e9)))
-    if config.rooms.enabled and config.grid.enabled:
+    if _has_rooms(config, found):
         from service.room_maker import RoomMaker
 
         rooms = config.rooms
@@ -592,6 +592,17 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
             )
         )
     return makers
+
+
+def _has_rooms(config: Config, found: Mapping[str, Sensor]) -> bool:
+    """Unless told: on a robot whose own grid a laser draws. Cones leave holes in walls, which would be doors."""
+    if not config.grid.enabled:
+        return False
+    if config.rooms.enabled is not None:
+        return config.rooms.enabled
+    drawn_by = _sources(config, config.grid.sources, found)
+    lasers = {name for name, sensor in found.items() if isinstance(sensor, Laser) and not sensor.tilts}
+    return config.localise.mode == "off" and bool(lasers & drawn_by)
 
 
 def _elevation_maker(config: Config) -> ElevationMaker:

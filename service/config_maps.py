@@ -183,8 +183,12 @@ class SceneMapSettings(Section):
 class RoomMapSettings(Section):
     """Rooms and doors with ids and names that stay: key map/rooms, calls @rpc/plan and @rpc/name_room. Needs [grid]."""
 
-    enabled: bool = Field(default=False, description="Keep it.")
-    period_s: float = Field(default=5.0, ge=1.0, le=3600, description="Shortest time between two that are made.")
+    enabled: bool | None = Field(
+        default=None, description="Keep it; default: where a laser draws the grid, fixed on the robot."
+    )
+    period_s: float = Field(
+        default=5.0, ge=1.0, le=3600, description="Shortest time between two that are made; longer for a large map."
+    )
     clearance_m: float = Field(default=0.3, ge=0.0, le=10.0, description="What plans keep off, if they are not told.")
 
 

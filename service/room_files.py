@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from mapping.grids.patch import GridPatch
 from service.export import MapFileTrouble, load_pgm_yaml, patch_of, read_pixels
 from service.files import FileTrouble, Receipt, write_whole
-from service.room_maker import FREE_BELOW, outline_of
+from service.room_maker import FREE_BELOW
+from service.room_outlines import RoomOutlines
 
 if TYPE_CHECKING:
     from mapping.hybrid.planner import DiagramGraph
@@ -95,6 +96,7 @@ def write_rooms(found: FoundRooms, path: Path) -> Receipt:
 
 def geojson_bytes(found: FoundRooms) -> bytes:
     """A FeatureCollection, a feature a line: rooms (Polygon), doors (LineString), then edges of the diagram."""
+    outlines = RoomOutlines().of(found.found, found.patch)
     features: list[dict[str, Any]] = [
         {
             "type": "Feature",
@@ -108,7 +110,7 @@ def geojson_bytes(found: FoundRooms) -> bytes:
             },
         }
         for room in found.found.rooms
-        for ring in [outline_of(found.found, room, found.patch)]
+        for ring in [outlines[room.number]]
     ]
     features += [
         {

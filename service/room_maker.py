@@ -7,6 +7,7 @@ names are kept in the store.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -19,14 +20,15 @@ from numpy.typing import NDArray
 from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
-from service.map_makers import MapView, Tile
+from service.map_makers import MapView, Rect, Tile
 from service.outputs import DocumentOut, Output
+from service.room_outlines import RoomOutlines
 from service.rpc import CallRefused
 
 if TYPE_CHECKING:
     from mapping.hybrid.planner import Plan, Planner, Way
     from mapping.hybrid.room_book import RoomBook
-    from mapping.hybrid.rooms import Room, RoomMap
+    from mapping.hybrid.rooms import RoomMap
     from mapping.hybrid.voronoi import VoronoiGrid
 
 Bools = NDArray[np.bool_]
@@ -35,11 +37,12 @@ F64 = NDArray[np.float64]
 KEY = "map/rooms"
 PLAN_KEY = "map/plan"
 FREE_BELOW = 35  # per cent; what is between free and occupied is not free
-_OUTLINE_M = 0.1
 _NAME_MAX = 64
 _ALTERNATIVES_MAX = 5
 _NAMES_ROW = 0  # ids begin at 1
 _SETTLE_TURNS = 3
+_NS_PER_CELL = 200  # that a turn costs, about
+_SHARE = 0.02  # of the time, at most
 _AS_GOOD = 0.8  # of the widest place's clearance: then the middle of a room stays where it was
 
 
@@ -68,12 +71,13 @@ class RoomMaker:
 
         self.name = "rooms"
         self.sources: frozenset[str] = frozenset()
-        self.period_ns = period_ns
+        self._period_ns = period_ns
         self._clearance_m, self._width_m, self._settle_turns = clearance_m, width_m, settle_turns
         self._book: RoomBook = RoomBook(settle=settle_turns)
         self._names_changed = False
         self._grid: GridPatch | None = None
         self._found: RoomMap | None = None
+        self._outlines = RoomOutlines()
         self._ids: dict[int, int] = {}
         self._middles: dict[int, tuple[int, int]] = {}
         """By id: the cell [row, col] of the map where the room is widest."""
@@ -84,6 +88,12 @@ class RoomMaker:
         self._planned: dict[str, Any] | None = None
         self._version = 0
         self._stamp_ns = 0
+
+    @property
+    def period_ns(self) -> int:
+        """As asked for, or longer where the map is so large that it would take more than its share of a core."""
+        cells = 0 if self._grid is None else self._grid.cells.size
+        return max(self._period_ns, round(cells * _NS_PER_CELL / _SHARE))
 
     def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
         """It is made from the grid."""
@@ -164,6 +174,7 @@ class RoomMaker:
         assert self._diagram is not None
         found, ids, grid = self._found, self._ids, self._grid
         squared = self._diagram.field.squared[1:-1, 1:-1]
+        outlines = self._outlines.of(found, grid)
         rooms = []
         for room in sorted((r for r in found.rooms if r.number in ids), key=lambda r: ids[r.number]):
             room_id = ids[room.number]
@@ -176,7 +187,7 @@ class RoomMaker:
                     "position": _rounded(_middle((row, col), grid)),
                     "clearance_m": round(math.sqrt(squared[row, col]) * grid.resolution_m, 3),
                     "area_m2": round(room.area_m2, 2),
-                    "outline": outline_of(found, room, grid),
+                    "outline": outlines[room.number],
                 }
             )
         doors = [
@@ -444,24 +455,6 @@ class RoomMaker:
         return passed
 
 
-def outline_of(found: RoomMap, room: Room, grid: GridPatch) -> list[list[float]]:
-    """The outer ring of a room's largest piece, simplified to about a decimetre; holes are left out."""
-    import shapely
-
-    rows, cols = np.nonzero(found.labels == room.number)
-    row0, col0 = int(rows.min()), int(cols.min())
-    mask = np.zeros((int(rows.max()) - row0 + 1, int(cols.max()) - col0 + 1), dtype=np.bool_)
-    mask[rows - row0, cols - col0] = True
-    edge = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    row, begin = np.nonzero(edge == 1)
-    _, end = np.nonzero(edge == -1)
-    d, x0, y0 = grid.resolution_m, col0 + grid.col0, row0 + grid.row0
-    runs = shapely.box((begin + x0) * d, (row + y0) * d, (end + x0) * d, (row + y0 + 1) * d)
-    whole = shapely.union_all(runs)
-    ring = max(shapely.get_parts(whole), key=lambda part: float(part.area)).exterior.simplify(_OUTLINE_M)
-    return [_rounded(point) for point in ring.coords[:-1]]
-
-
 def _free(grid: GridPatch) -> Bools:
     return np.asarray((grid.cells >= 0) & (grid.cells < FREE_BELOW))
 
@@ -496,3 +489,16 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 def _rounded(values: Any) -> list[float]:
     return [round(float(value), 3) + 0.0 for value in values]
+
+
+def warm_up() -> None:
+    """Load or compile every kernel that rooms and plans use: a turn, a change, and plans in a small house."""
+    cells = np.full((60, 130), 100, dtype=np.int8)
+    cells[2:58, 2:64] = cells[2:58, 66:128] = cells[25:35, 60:70] = 0
+    maker, here = RoomMaker(settle_turns=1), Pose2(0.4, 0.4, 0.0)
+    for stamp_ns in range(2):
+        cells[30, 20 + stamp_ns] = 100
+        maker.make(MapView(stamp_ns, GridPatch(0.1, 0, 0, cells), (Rect(0, 0, *cells.shape),), here))
+    maker.plan({"goal": [12.0, 5.0]})  # out of a corner, to a place
+    with contextlib.suppress(CallRefused):
+        maker.plan({"start": 1, "goal": 2, "clearance_m": 0.6})  # too wide: looks for places that are joined

@@ -87,8 +87,8 @@ def _steps(config: Config) -> dict[str, Step]:
         from mapping.features.warm_up import warm_up as warm_up_features
 
         steps["features"] = warm_up_features
-    if config.rooms.enabled and config.grid.enabled:
-        from mapping.hybrid.warm_up import warm_up as warm_up_rooms
+    if "rooms" in names:
+        from service.room_maker import warm_up as warm_up_rooms
 
         steps["rooms"] = warm_up_rooms
     if config.localise.mode == "map":

@@ -243,6 +243,37 @@ def test_names_are_told_kept_and_belong_to_one_room() -> None:
         again.restore([(0, 0, b'{"next": 2, "names": {}}'), (1, 0, b"rubbish")])
 
 
+def test_a_robot_whose_grid_a_laser_draws_has_rooms_without_being_told() -> None:
+    laser = {"driver": "hokuyo", "port": "/dev/none"}
+    here = {"lasers": {"front": laser}}
+    other = {"lasers": {"front": laser}, "localise": {"mode": "map", "map": "house.yaml"}}
+    off = {"lasers": {"front": laser}, "rooms": {"enabled": False}}
+    for given, has_rooms in ((here, True), (other, False), (off, False)):
+        config = Config.model_validate(given)
+        makers = assemble.map_makers(config, assemble.sensors(config))
+        assert any(isinstance(maker, RoomMaker) for maker in makers) is has_rooms
+
+
+def test_large_maps_are_looked_at_less_often() -> None:
+    """A turn costs some 0.2 us a cell: at most 2 % of the time."""
+    maker = RoomMaker()
+    told(maker, house())
+    assert maker.period_ns == 5_000_000_000
+    wide = GridPatch(CELL_M, 0, 0, np.zeros((1000, 1000), dtype=np.int8))
+    told(maker, wide)
+    assert maker.period_ns == 10_000_000_000
+
+
+def test_outlines_of_rooms_that_stayed_are_those_worked_out_anew() -> None:
+    kept, grid = RoomMaker(settle_turns=1), house()
+    told(kept, grid)
+    grid.cells[5:30, 100:106] = 100
+    document, anew = told(kept, grid), told(RoomMaker(settle_turns=1), grid)
+    assert document is not None
+    assert anew is not None
+    assert [each["outline"] for each in document["rooms"]] == [each["outline"] for each in anew["rooms"]]
+
+
 def test_it_is_built_from_the_configuration() -> None:
     assert not any(isinstance(maker, RoomMaker) for maker in assemble.map_makers(Config(), {}))
     config = Config.model_validate({"rooms": {"enabled": True, "period_s": 2.0}})
