@@ -53,7 +53,8 @@ class ScanReading:
     """One sweep of a laser rangefinder, beams in the order they were measured.
 
     stamp_ns: the first beam, host clock.  beam_period_ns: time from one beam to the next (0 if all at once).
-    bearing_rad: (N,) sensor frame.  range_m: (N,) by this module's rule.  intensity: (N,) device units, or None.
+    bearing_rad: (N,) sensor frame, running on where it passes the back (no jump of a turn).
+    range_m: (N,) by this module's rule.  intensity: (N,) device units, or None.
     device_stamp_ns: the device's own clock at the first beam, unwrapped, or None.
     scan_period_ns: time from this sweep's first beam to the next sweep's, as the device profile gives it.
     """

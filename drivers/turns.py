@@ -181,5 +181,5 @@ class TurnAssembler:
 
 
 def bearings(angle_rad: F64) -> F64:
-    """(N,) clockwise angles as counter-clockwise bearings in -pi..pi."""
-    return np.asarray(math.pi - np.mod(angle_rad + math.pi, _TURN))
+    """(N,) clockwise angles of one turn as counter-clockwise bearings, the first in -pi..pi, no jump after it."""
+    return np.unwrap(math.pi - np.mod(angle_rad + math.pi, _TURN))

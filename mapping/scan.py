@@ -15,7 +15,7 @@ class Scan:
     """A sweep in the frame of its sensor, beams in the order they were measured.
 
     stamp_ns: the first beam.  beam_period_ns: from one beam to the next (0: all at once).
-    bearing_rad: (N,) counter-clockwise from the sensor's x axis.
+    bearing_rad: (N,) counter-clockwise from the sensor's x axis; a sweep that passes the back runs on beyond pi.
     range_m: (N,) +inf nothing seen up to range_max_m, -inf too close to measure, NaN invalid (nothing known).
     """
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
-from mapping.lines.extract import LineExtractor, extract_from_points
+from mapping.lines.extract import LineExtractor, are_in_order, extract_from_points
 from mapping.lines.lines import Lines
 from mapping.localise.ekf import EkfRules, LineEkf, step_covariance
 from mapping.odometry import DriveGeometry, OdometryState
@@ -126,10 +126,9 @@ def _lines_of(scan: Scan) -> Lines:
     """The lines of a de-skewed scan, whose bearings may lie in any order."""
     seen = np.isfinite(scan.range_m) & (scan.range_m >= scan.range_min_m) & (scan.range_m <= scan.range_max_m)
     bearing, reach = scan.bearing_rad[seen], scan.range_m[seen]
-    step = np.diff(bearing)
-    if len(bearing) > 2 and (np.all(step > 0.0) or np.all(step < 0.0)) and float(np.abs(step).sum()) < 2.0 * math.pi:
+    if len(bearing) > 2 and are_in_order(bearing):
         return LineExtractor(bearing).extract(reach)
     order = np.argsort(bearing, kind="stable")
     points = np.stack((reach * np.cos(bearing), reach * np.sin(bearing)), axis=-1)[order]
-    spacing = float(np.median(np.abs(step))) if len(step) else 0.0
+    spacing = float(np.median(np.abs(np.diff(bearing)))) if len(bearing) > 1 else 0.0
     return extract_from_points(points, spacing_rad=spacing, full_turn=False)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2, wrap_angle
-from mapping.lines.extract import LineExtractor, LineRules, extract_from_points
+from mapping.lines.extract import LineExtractor, LineRules, are_in_order, extract_from_points
 from mapping.lines.line_map import LineMap
 from mapping.lines.lines import Lines, no_lines
 from mapping.scan import Scan
@@ -124,8 +124,9 @@ class LineMaker:
 
     def _lines(self, source: str, scan: Scan, poses: F64, middle: Pose2) -> Lines:
         """Of a standing sensor by its beams, of a moving one by its points, seen from where it was midway."""
+        in_order = are_in_order(scan.bearing_rad)
         place, yaw = np.abs(poses[:, :2] - poses[0, :2]).max(), np.abs(poses[:, 2] - poses[0, 2]).max()
-        if place < _STILL_M and yaw < _STILL_RAD:
+        if in_order and place < _STILL_M and yaw < _STILL_RAD:
             return self._extractor(source, scan).extract(scan.range_m)
         seen = np.isfinite(scan.range_m) & (scan.range_m > 0.0) & (scan.range_m <= scan.range_max_m)
         if np.count_nonzero(seen) < 2:
@@ -133,7 +134,9 @@ class LineMaker:
         at, r = poses[seen], scan.range_m[seen]
         angle = scan.bearing_rad[seen] + at[:, 2]
         points = middle.inverse().apply(at[:, :2] + r[:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1))
-        if scan.bearing_rad[0] > scan.bearing_rad[-1]:
+        if not in_order:
+            points = points[np.argsort(np.arctan2(points[:, 1], points[:, 0]), kind="stable")]
+        elif scan.bearing_rad[0] > scan.bearing_rad[-1]:
             points = points[::-1]
         spacing = float(np.median(np.abs(np.diff(scan.bearing_rad))))
         return extract_from_points(points, self._rules, spacing_rad=spacing)

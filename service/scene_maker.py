@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mapping.features.scenes import Answer, Candidate, SceneDatabase, sight_of
 from mapping.frames import Pose2, wrap_angle
+from mapping.lines.extract import are_in_order
 from mapping.scan import Scan
 from service.map_makers import MapView, Tile
 from service.outputs import DocumentOut, Output
@@ -63,7 +64,7 @@ class SceneMaker:
         if not np.all(np.isfinite(poses)) or len(scan.bearing_rad) < 3:
             return
         still = scan if len(poses) == 1 else _as_seen_from(middle, scan, poses)
-        if still is None or not _is_in_order(still.bearing_rad):
+        if still is None or not are_in_order(still.bearing_rad):  # kept in few bits, or turned fast
             return
         self._newest[source], self._newest_source = still, source
         if self._has_moved(source, middle) and not self.database.covers(middle):
@@ -184,12 +185,6 @@ def _candidate_fields(candidate: Candidate, sensor_from_base: Pose2) -> dict[str
 
 def _pose_fields(pose: Pose2) -> dict[str, float]:
     return {"x_m": round(pose.x_m, 4), "y_m": round(pose.y_m, 4), "yaw_rad": round(pose.yaw_rad, 6)}
-
-
-def _is_in_order(bearing_rad: F64) -> bool:
-    """Whether bearings rise or fall throughout: those of a sweep kept in few bits, or turned fast, may not."""
-    step = np.diff(bearing_rad)
-    return bool(np.all(step > 0.0) or np.all(step < 0.0))
 
 
 def _as_seen_from(middle: Pose2, scan: Scan, poses: F64) -> Scan | None:

@@ -88,12 +88,10 @@ class LineExtractor:
         bearing = np.array(bearing_rad, dtype=np.float64)
         if bearing.ndim != 1 or not np.all(np.isfinite(bearing)):
             raise ValueError("bearing_rad is one row of finite angles")
-        step = np.diff(bearing)
-        self._falling = bool(bearing.size > 1 and bearing[0] > bearing[-1])
-        if self._falling:
-            step = -step
-        if np.any(step <= 0.0) or float(np.sum(step)) >= 2.0 * math.pi + 1e-9:
+        if not are_in_order(bearing):
             raise ValueError("bearing_rad must rise or fall throughout, by no more than a full turn")
+        self._falling = bool(bearing.size > 1 and bearing[0] > bearing[-1])
+        step = np.abs(np.diff(bearing))
         if math.isnan(range_min_m) or math.isnan(range_max_m) or range_max_m <= max(range_min_m, 0.0):
             raise ValueError(f"range_max_m must be above range_min_m and 0, got {range_min_m} to {range_max_m}")
         self.rules = rules or LineRules()
@@ -139,6 +137,12 @@ def extract_lines(
 ) -> Lines:
     """Lines of a single scan; for many of one device keep a LineExtractor."""
     return LineExtractor(bearing_rad, rules, range_min_m=range_min_m, range_max_m=range_max_m).extract(range_m)
+
+
+def are_in_order(bearing_rad: F64) -> bool:
+    """Whether bearings (N,) rise or fall throughout, by no more than a full turn; those of a trembling head may not."""
+    step = np.diff(bearing_rad)
+    return bool((np.all(step > 0.0) or np.all(step < 0.0)) and np.abs(step).sum() < 2.0 * math.pi + 1e-9)
 
 
 def extract_from_points(

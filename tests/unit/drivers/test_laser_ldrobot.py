@@ -179,13 +179,16 @@ def test_turns_of_a_steady_head() -> None:
     assert d.conversation.counters.drops == {}
 
 
-def test_bearings_are_counter_clockwise_and_wrapped() -> None:
+def test_bearings_are_counter_clockwise_and_run_on_behind_the_head() -> None:
     d = desk(Head(wall=lambda angle: 500 if 80 < angle % 360 < 100 else 0))
     d.run(120)
     reading = d.readings[-1]
     seen = reading.bearing_rad[np.isfinite(reading.range_m)]
     assert np.degrees(seen).mean() == pytest.approx(-90, abs=1)  # to the right
-    assert np.abs(reading.bearing_rad).max() <= math.pi
+    step = np.diff(reading.bearing_rad)
+    assert np.all(step < 0.0)
+    assert -2.0 * math.pi < step.sum() < -1.99 * math.pi
+    assert abs(reading.bearing_rad[0]) < 0.02
 
 
 @pytest.mark.parametrize("speed", [2152, 3600, 4500])

@@ -88,6 +88,28 @@ def test_a_moving_laser_sees_straight_walls(falling: bool) -> None:
     assert np.all(way[:, 0] * to_robot[:, 1] - way[:, 1] * to_robot[:, 0] < 0.0)  # free to the right
 
 
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("trembling", [False, True])
+def test_a_head_that_turns_clockwise_all_round_sees_each_wall_from_its_free_side(moving: bool, trembling: bool) -> None:
+    """As the scanners with a turning head tell it: from straight ahead to the right and round, 0 to nearly -360."""
+    bearing = -np.radians(np.arange(0.0, 359.3, 0.8))
+    if trembling:
+        bearing[99::100] += 0.02  # behind the one before
+    maps = maker()
+    for start in (0.0, 0.3):
+        t = np.linspace(0.0, 0.1, bearing.size)
+        poses = np.stack((start + (2.0 * t if moving else 0.0 * t), 0.0 * t, 0.0 * t), axis=-1)
+        angle = bearing + poses[:, 2]
+        with np.errstate(divide="ignore"):
+            along = np.where(np.cos(angle) > 0.0, WALL_X_M - poses[:, 0], -2.0 - poses[:, 0]) / np.cos(angle)
+            across = np.where(np.sin(angle) > 0.0, 3.0, -1.5) / np.sin(angle)
+        maps.take_sweep("front", Scan(0, 0.0, bearing, np.minimum(along, across), 0.1, 20.0), poses)
+    lines = maps.line_map.lines(min_seen=2)
+    np.testing.assert_allclose(sorted({round(float(d), 2) for d in lines.parameters()[1]}), [1.5, 2.0, 3.0, 5.0])
+    way, to_robot = lines.end_m - lines.start_m, np.array([0.5, 0.0]) - lines.start_m
+    assert np.all(way[:, 0] * to_robot[:, 1] - way[:, 1] * to_robot[:, 0] < 0.0)  # free to the right
+
+
 def test_sweeps_without_a_pose_or_an_echo_are_left_out() -> None:
     maps = maker()
     lost = still(1.0)
