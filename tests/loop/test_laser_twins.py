@@ -85,8 +85,9 @@ def profile(found: list[ScanReading], bearing_rad: np.ndarray) -> np.ndarray:
     """Median range over the scans, at these bearings."""
     rows = []
     for scan in found:
-        order = np.argsort(scan.bearing_rad)
-        bearing, distance = scan.bearing_rad[order], scan.range_m[order]
+        wrapped = (scan.bearing_rad + np.pi) % (2.0 * np.pi) - np.pi
+        order = np.argsort(wrapped)
+        bearing, distance = wrapped[order], scan.range_m[order]
         nearest = np.clip(np.searchsorted(bearing, bearing_rad), 1, len(bearing) - 1)
         nearest -= bearing_rad - bearing[nearest - 1] < bearing[nearest] - bearing_rad
         rows.append(distance[nearest])
