@@ -35,7 +35,10 @@ _STEPS_A_CELL = 6.0
 _JOIN_SLOPES = 5.0  # parts of one plane differ in direction by at most so many times what it may warp
 _WAVE = 0.06  # a surface's scatter about its plane, against that along its shorter side: 0.06 is a kink of 14 degrees
 _ROUGHER = 3.0  # and against that of its parts about theirs: a step scatters more, a wave does not
-_FOREIGN = 0.5
+_FOREIGN = 0.5  # tolerances: the start of a cell's own plane
+_NEAR = 64  # planes that a point may belong to
+_OVER = 0.05  # share of a plane's points that lie beyond another at which it ends
+_SIDE_LEAST = 10  # points, to say that it ends
 _WORST_DOUBT = 0.13  # rad: half of what normals of neighbours may differ by
 
 
@@ -825,17 +828,74 @@ def label_inliers(
 
 
 @njit(cache=True, nogil=True)
+def touching_regions(region: Any, first: Any, neighbour: Any) -> Any:
+    """(mark, index, pairs): a table of the pairs of regions that have touching cells, by `pair_name` (see put, get)."""
+    size = 64
+    mark, index = np.full(size, -1, np.int64), np.empty(size, np.int64)
+    pairs, last = 0, np.int64(-1)
+    for c in range(region.size):
+        for k in range(first[c], first[c + 1]):
+            other = region[neighbour[k]]
+            if other <= region[c] or region[c] < 0:
+                continue
+            name = pair_name(region[c], other)
+            if name == last or get(mark, index, name) >= 0:
+                continue
+            if 3 * pairs >= mark.size:
+                old_mark, old_index = mark, index
+                mark, index = np.full(2 * old_mark.size, -1, np.int64), np.empty(2 * old_mark.size, np.int64)
+                for i in range(old_mark.size):
+                    if old_mark[i] >= 0:
+                        put(mark, index, old_mark[i], old_index[i])
+            put(mark, index, name, pairs)
+            last = name
+            pairs += 1
+    return mark, index, pairs
+
+
+@njit(cache=True, nogil=True)
+def pair_name(a: int, b: int) -> Any:
+    """The name of two regions, whichever comes first."""
+    return (min(a, b) << 31) | max(a, b)
+
+
+@njit(cache=True, nogil=True)
+def edges_of_sides(sides: Any, mark: Any, index: Any, edge: Any) -> None:
+    """Where planes end at each other: edge (E, 2) becomes (alpha, beta) of pairs a < b that do, zeros of others.
+
+    sides (E, 4): of the points of a, how many lie before and behind b, clear of it, and of those of b before and behind
+    a. If nearly all of a plane's lie on one side of the other, and so for the other's, both end where they meet, and a
+    point belongs to a where alpha A + beta B > 0, A and B its signed distances: that is which side of the middle
+    between both it lies on. Noise moves a point off both at once and drops out of the difference.
+    """
+    for e in range(sides.shape[0]):
+        a_before, a_behind, b_before, b_behind = sides[e, 0], sides[e, 1], sides[e, 2], sides[e, 3]
+        edge[e, 0], edge[e, 1] = 0.0, 0.0
+        if min(a_before, a_behind) > _OVER * (a_before + a_behind):
+            continue
+        if min(b_before, b_behind) > _OVER * (b_before + b_behind):
+            continue
+        if a_before + a_behind < _SIDE_LEAST or b_before + b_behind < _SIDE_LEAST:
+            continue
+        edge[e, 0] = -1.0 if b_before > b_behind else 1.0
+        edge[e, 1] = 1.0 if a_before > a_behind else -1.0
+
+
+@njit(cache=True, nogil=True)
 def label_nearest(
     x: Any, y: Any, z: Any, begin: Any, end: Any, region: Any, first: Any, neighbour: Any, plane: Any, rms: Any,
-    rules: Any, from_cell: int, to_cell: int, label: Any,
+    rules: Any, mark: Any, index: Any, edge: Any, from_cell: int, to_cell: int, label: Any, sides: Any,
 ) -> None:  # fmt: skip
     """Labels of the points of cells from_cell to to_cell - 1: of the planes of its cell and of those that touch it,
-    the one that is fewest tolerances away, if that is less than one; else -1. The cell's own plane has a start of
-    _FOREIGN, or every plane that ends on a table would cut a strip out of it.
+    the one that is fewest tolerances away, if that is less than one; else -1. Of two planes that end at each other
+    (`edges_of_sides`) the side counts that a point lies on. Otherwise the cell's own plane has a start of _FOREIGN, or
+    every plane that ends on a table would cut a strip out of it.
 
-    plane: (R, 4) n and d; rms: (R,), a tolerance grows with what a plane's own points scatter.
+    plane: (R, 4) n and d; rms: (R,), a tolerance grows with what a plane's own points scatter.  mark, index: pairs of
+    regions (`touching_regions`).  edge: (E, 2).  sides: (E, 4), counted here.
     """
-    near = np.empty(64, np.int64)
+    near, off = np.empty(_NEAR, np.int64), np.empty(_NEAR)
+    pair = np.full((_NEAR, _NEAR), -1, np.int64)
     for c in range(from_cell, to_cell):
         count = 0
         if region[c] >= 0:
@@ -853,20 +913,39 @@ def label_nearest(
             if new:
                 near[count] = r
                 count += 1
+        for i in range(count):
+            for j in range(i):
+                pair[i, j] = get(mark, index, pair_name(near[i], near[j]))
+                pair[j, i] = pair[i, j]
         for k in range(begin[c], end[c]):
-            best, at = 1.0 + _FOREIGN, -1
+            at, best = -1, 0.0
             sigma = noise(x[k] * x[k] + y[k] * y[k] + z[k] * z[k], rules)
             for i in range(count):
                 r = near[i]
-                off = abs(plane[r, 0] * x[k] + plane[r, 1] * y[k] + plane[r, 2] * z[k] - plane[r, 3])
-                off /= rules[INLIER_SIGMAS] * max(sigma, rms[r]) + rules[FLAT_M]
-                if off > 1.0:
+                off[i] = plane[r, 0] * x[k] + plane[r, 1] * y[k] + plane[r, 2] * z[k] - plane[r, 3]
+                apart = abs(off[i]) / (rules[INLIER_SIGMAS] * max(sigma, rms[r]) + rules[FLAT_M])
+                if apart > 1.0:
                     continue
                 if r != region[c]:
-                    off += _FOREIGN
-                if off < best:
-                    best, at = off, r
-            label[k] = at
+                    apart += _FOREIGN
+                if at >= 0:
+                    e = pair[i, at]
+                    if e >= 0 and edge[e, 0] != 0.0:
+                        a, b = (i, at) if r < near[at] else (at, i)
+                        if (edge[e, 0] * off[a] + edge[e, 1] * off[b] > 0.0) == (a == at):
+                            continue
+                    elif apart >= best:
+                        continue
+                at, best = i, apart
+            label[k] = near[at] if at >= 0 else -1
+            if at < 0:
+                continue
+            for i in range(count):
+                e = pair[i, at]
+                if i != at and e >= 0:
+                    limit = rules[INLIER_SIGMAS] * max(sigma, rms[near[i]]) + rules[FLAT_M]
+                    if abs(off[i]) > limit:
+                        sides[e, (0 if near[at] < near[i] else 2) + (1 if off[i] < 0.0 else 0)] += 1
 
 
 @njit(cache=True, nogil=True)
@@ -904,6 +983,24 @@ def sums_of_labels(x: Any, y: Any, z: Any, weight: Any, label: Any, centre: Any,
         s[ZZ] -= w * c * c
         s[CX], s[CY], s[CZ] = centre[r, 0] + a, centre[r, 1] + b, centre[r, 2] + c
         fit_plane(s)
+
+
+@njit(cache=True, nogil=True)
+def leave_out(weak: Any, number: Any) -> None:
+    """Regions that are weak (R,) vanish from numbers (of cells or of points)."""
+    for k in range(number.size):
+        if number[k] >= 0 and weak[number[k]]:
+            number[k] = -1
+
+
+@njit(cache=True, nogil=True)
+def rms_of(sums: Any) -> Any:
+    """(R,) of the distances of the points of rows (R, ROW) from their planes."""
+    rms = np.zeros(sums.shape[0])
+    for r in range(sums.shape[0]):
+        if sums[r, WEIGHT] > 0.0:
+            rms[r] = math.sqrt(square_sum(sums[r]) / sums[r, WEIGHT])
+    return rms
 
 
 # ------------------------------------------------------------------------------------------------------------ outlines

@@ -357,21 +357,29 @@ class _Extraction:
         least = self.rules.min_support or self.rules.min_cells * self.rules.min_points
         sums = _renumber(region, sums[:, kernels.COUNT] >= 0.5 * least, sums)
         cut = np.linspace(0, len(region), _CHUNKS + 1).astype(np.int64)
+        mark, index, pairs = kernels.touching_regions(region, first, neighbour)
+        edge = np.zeros((pairs, 2))
         for _ in range(_ROUNDS):
             plane = sums[:, kernels.NX : kernels.D + 1].copy()
-            rms = np.array([math.sqrt(kernels.square_sum(s) / s[kernels.WEIGHT]) for s in sums])
+            rms = kernels.rms_of(sums)
 
-            def work(part: int, plane: F64 = plane, rms: F64 = rms, label: I64 = label) -> None:
+            def work(part: int, plane: F64 = plane, rms: F64 = rms, label: I64 = label) -> I64:
+                sides = np.zeros((pairs, 4), dtype=np.int64)
                 kernels.label_nearest(
                     self.x, self.y, self.z, self.begin, self.end, region, first, neighbour, plane, rms, self.vector,
-                    int(cut[part]), int(cut[part + 1]), label,
+                    mark, index, edge, int(cut[part]), int(cut[part + 1]), label, sides,
                 )  # fmt: skip
+                return sides
 
-            list(self.run(work, range(_CHUNKS)))
+            sides = sum(self.run(work, range(_CHUNKS)))
+            kernels.edges_of_sides(sides, mark, index, edge)
             kernels.sums_of_labels(self.x, self.y, self.z, self.weight, label, sums[:, 1:4].copy(), sums)
-            enough = sums[:, kernels.COUNT] >= least
-            if np.all(enough):
-                continue
+            weak = sums[:, kernels.COUNT] < least
+            if np.any(weak):
+                kernels.leave_out(weak, region)
+                kernels.leave_out(weak, label)
+        enough = sums[:, kernels.COUNT] >= least
+        if not np.all(enough):
             sums = _renumber(region, enough, sums)
             label = np.where(label >= 0, (np.cumsum(enough) - 1)[label], -1)
         return label, sums
