@@ -4,7 +4,8 @@
 
 The map: 2000 x 2000 cells of 5 cm with the office or the hall of bench/grid_insert.py in its middle. Scans go into an
 occupancy grid; after each the cells whose state changed are handed to the distance field. Four passes over the same
-places with new noise: the first explores, the others are what a robot does all day. --opencv: a Python with cv2, whose
+places with new noise: the first explores, the others are what a robot does all day; once with every distance and once
+with those up to 2 m, which is how far the daemon's costs reach. --opencv: a Python with cv2, whose
 distanceTransform (L2, precise) gets the same map. Milliseconds, medians (10 % to 90 %).
 """
 
@@ -32,6 +33,7 @@ from mapping.grids.occupancy import OccupancyGrid
 
 SIDE = 2000
 PASSES = 4
+REACH_CELLS = 40
 UPDATE_GOAL_MS, SCRATCH_GOAL_MS = 2.0, 60.0
 OPENCV = """
 import sys, time, numpy, cv2
@@ -43,9 +45,10 @@ for _ in range(int(sys.argv[2])):
 """
 
 
-def updates(place: str) -> tuple[list[dict[str, Any]], NDArray[np.bool_]]:
+def updates(place: str, reach_cells: int | None) -> tuple[list[dict[str, Any]], NDArray[np.bool_]]:
     """Figures of each pass, and the obstacles at the end."""
-    grid, field = OccupancyGrid(resolution_m=CELL_M), DistanceField(np.zeros((SIDE, SIDE), dtype=np.bool_))
+    grid = OccupancyGrid(resolution_m=CELL_M)
+    field = DistanceField(np.zeros((SIDE, SIDE), dtype=np.bool_), reach_cells=reach_cells)
     rng = np.random.default_rng(30)
     rows = []
     for number in range(PASSES):
@@ -63,6 +66,7 @@ def updates(place: str) -> tuple[list[dict[str, Any]], NDArray[np.bool_]]:
         rows.append(
             {
                 "place": place,
+                "reach_cells": reach_cells,
                 "pass": number,
                 "median_ms": round(middle, 2),
                 "p10_ms": round(low, 2),
@@ -130,17 +134,19 @@ def main() -> int:
     parser.add_argument("--opencv", help="a Python that has cv2")
     parser.add_argument("--json", type=Path, help="write the figures here as well")
     options = parser.parse_args()
-    warm = DistanceField(np.eye(8, dtype=np.bool_))
-    warm.update([(0, 1)], [(0, 0), (1, 1)])
     rows, masks = [], {}
-    for place in ("office", "hall"):
-        more, masks[place] = updates(place)
-        rows += more
+    for reach in (None, REACH_CELLS):
+        warm = DistanceField(np.eye(8, dtype=np.bool_), reach_cells=reach)
+        warm.update([(0, 1)], [(0, 0), (1, 1)])
+        for place in ("office", "hall"):
+            more, masks[place] = updates(place, reach)
+            rows += more
     from_scratch = {place: scratch(mask, options.rounds, options.opencv) for place, mask in masks.items()}
     grown = growth(options.rounds)
     for row in rows:
         print(
-            f"{row['place']:7} pass {row['pass']}: update {row['median_ms']} ms ({row['p10_ms']} to {row['p90_ms']}),"
+            f"{row['place']:7} up to {row['reach_cells'] or 'any'} cells, pass {row['pass']}: "
+            f"update {row['median_ms']} ms ({row['p10_ms']} to {row['p90_ms']}),"
             f" {row['cells_changed']} cells changed, {row['distances_looked_at']} distances"
         )
     for place, figures in from_scratch.items():
@@ -150,7 +156,7 @@ def main() -> int:
         options.json.write_text(
             json.dumps({"updates": rows, "scratch": from_scratch, "growth": grown}, indent=2) + "\n"
         )
-    kept = all(row["median_ms"] <= UPDATE_GOAL_MS for row in rows if row["pass"] > 0)
+    kept = all(row["median_ms"] <= UPDATE_GOAL_MS for row in rows)
     return 0 if kept and all(figures["ours"] <= SCRATCH_GOAL_MS for figures in from_scratch.values()) else 1
 
 

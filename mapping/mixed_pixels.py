@@ -24,6 +24,7 @@ from mapping.kernels import beams as kernels
 F64 = NDArray[np.float64]
 
 GRAZING_RAD: Final = math.radians(10.0)
+_COT_GRAZING: Final = 1.0 / math.tan(GRAZING_RAD)
 STEP_M: Final = 0.10  # edges nearer to what is behind them are left alone
 OFF_M: Final = 0.03  # how far off a straight wall each of its beams may end
 WIDEST_RAD: Final = 0.05  # between neighbours; farther apart, beams know nothing of each other
@@ -40,5 +41,5 @@ def without_mixed_pixels(bearing_rad: F64, range_m: F64) -> tuple[F64, int]:
     if bearing.ndim != 1 or bearing.shape != ranges.shape:
         raise ValueError(f"bearings and ranges must be (N,) alike, got {bearing.shape} and {ranges.shape}")
     kept = np.empty_like(ranges)
-    dropped = kernels.drop_mixed(bearing, ranges, 1.0 / math.tan(GRAZING_RAD), STEP_M, OFF_M, WIDEST_RAD, kept)
+    dropped = kernels.drop_mixed(bearing, ranges, _COT_GRAZING, STEP_M, OFF_M, WIDEST_RAD, kept)
     return kept, int(dropped)

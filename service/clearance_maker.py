@@ -2,7 +2,7 @@
 
 Each cell says how near the next occupied cell is, as a cost that falls evenly with the distance, so that the same
 numbers can be shown, planned on, and turned back into metres: distance = (1 - cost / 100) * reach, to a hundredth of
-the reach and never too far. Exact distances are kept up to date from what changed in the grid.
+the reach and never too far. Exact distances up to the reach are kept up to date from what changed in the grid.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ class ClearanceMaker:
         rows, cols = grid.cells.shape
         if field is None or self._place != place or field.shape != (rows + 2, cols + 2):
             around = np.pad(self._obstacles(grid.cells), 1, constant_values=self._unknown_is_obstacle)
-            field = self._field = DistanceField(around)  # with a rim of one cell: outside, nothing is known
+            reach = math.ceil(self._reach_m / grid.resolution_m)
+            field = self._field = DistanceField(around, reach_cells=reach)  # a rim of a cell: outside, nothing is known
             self._place = place
             return field
         added, removed = [], []

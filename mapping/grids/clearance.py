@@ -47,11 +47,15 @@ class DistanceField:
     squared: (R, C) int32, squared distance in cells between centres; kernels.FAR where there is no obstacle at all.
     site: (R, C) int32, the nearest obstacle cell as row << 16 | column, -1 if there is none; of several the one in the
     smallest column, then in the smallest row. Both are views to read, changed by the next update.
+    reach_cells: what is farther from every obstacle than this counts as if there were none, so that a change costs
+    what lies within reach of it and not what it rules of the map; None: any distance is kept.
     Updated or made anew, the same obstacles give the same arrays. Memory: 9 bytes a cell.
-    Raises ValueError if obstacle is not (R, C) or has a side above 20,000.
+    Raises ValueError if obstacle is not (R, C) or has a side above 20,000, or for a reach below 0.
     """
 
-    def __init__(self, obstacle: Bools) -> None:
+    def __init__(self, obstacle: Bools, *, reach_cells: int | None = None) -> None:
+        if reach_cells is not None and reach_cells < 0:
+            raise ValueError(f"reach_cells is a number of cells, got {reach_cells}")
         if obstacle.ndim != 2 or max(obstacle.shape) > MAX_SIDE_CELLS:
             raise ValueError(f"obstacles are (R, C) with sides up to {MAX_SIDE_CELLS}, got {obstacle.shape}")
         rows, cols = obstacle.shape
@@ -59,6 +63,8 @@ class DistanceField:
         self.squared: I32 = np.empty((rows, cols), dtype=np.int32)
         self.site: I32 = np.empty((rows, cols), dtype=np.int32)
         self._obstacle = obstacle.astype(np.uint8)
+        self._reach = kernels.UNLIMITED if reach_cells is None else min(int(reach_cells), kernels.UNLIMITED)
+        self._half = kernels.half_widths(self._reach) if self._reach < kernels.UNLIMITED else None
         self._columns: NDArray[np.uint64] | None = None
         self._spans: I32 = np.empty((rows, 2), dtype=np.int32)
         self._work = [np.empty(cols + 1, dtype=np.int32) for _ in range(4)]
@@ -69,7 +75,7 @@ class DistanceField:
         rows, cols = self.shape
         nearest = np.empty((rows, cols), dtype=np.int16)
         kernels.nearest_rows(self._obstacle, nearest, np.empty(cols, dtype=np.int32))
-        kernels.row_envelopes(nearest, 0, rows, self.squared, self.site, *self._work[:3])
+        kernels.row_envelopes(nearest, 0, rows, self._reach, self.squared, self.site, *self._work[:3])
 
     @property
     def obstacle(self) -> Bools:
@@ -80,7 +86,7 @@ class DistanceField:
         """Obstacles that came and obstacles that went: (N, 2) cells [row, col] each, N may be 0.
 
         Cells that are as said already are passed over; a cell in both lists ends as an obstacle.
-        Returns (R, 2) first and end column of what changed in each row; first >= end: nothing.
+        Returns (R, 2) first and end column of what changed in each row, or might have; first >= end: nothing.
         Time: the cells whose nearest obstacle changes, and some steps for each row between. A change that concerns
         half of the map (the first wall in a wide unknown) costs as much as a new transform.
         Raises ValueError for cells that are not (N, 2) whole numbers or not in the rectangle.
@@ -96,6 +102,12 @@ class DistanceField:
         if self._columns is None:
             self._columns = np.zeros((self.shape[1], (self.shape[0] + 63) // 64), dtype=np.uint64)
             self._count = kernels.column_bits(self._obstacle, self._columns)
+        if self._half is not None:
+            near = np.zeros((self.shape[0], (self.shape[1] + 31) // 32), dtype=np.uint8)
+            kept = (self._obstacle, self._columns, self.squared, self.site, self._spans)
+            kernels.add_within(new, self._half, *kept)
+            kernels.remove_within(lost, self._half, near, *kept, *self._work)
+            return self._spans
         self._count += len(new) - len(lost)
         if self._count == len(new) or self._count == 0:
             self._start_anew(new, lost)

@@ -35,5 +35,5 @@ def warm_up(model: Model = "counters") -> None:
         grid.load_tile(row, col, payload)
     grid.empty_copy().take_tiles(grid, grid.places())
     clearance_layer(grid.patch())
-    field = DistanceField(np.eye(3, dtype=np.bool_))
-    field.update([(0, 1), (0, 2)], [(0, 0), (1, 1)])
+    for reach in (None, 2):
+        DistanceField(np.eye(3, dtype=np.bool_), reach_cells=reach).update([(0, 1), (0, 2)], [(0, 0), (1, 1)])

@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 from numba import njit
+
+from mapping.kernels.sectors import point_in_polygon
 
 TWO_PI = 2.0 * math.pi
 
@@ -45,11 +48,18 @@ def drop_mixed(
         kept[k] = distance[k]
     if n < 5:
         return 0
+    steep = np.zeros(n, np.bool_)  # a loop without branches, which the compiler makes wide; few beams are
+    for k in range(np.uint64(1), np.uint64(n - 1)):
+        up, down = distance[k + 1] - distance[k], distance[k] - distance[k - 1]  # NaN fails
+        steep[k] = ((up > step_m) & (down > step_m)) | ((up < -step_m) & (down < -step_m))
+    steep[0] = steep[n - 1] = True  # looked at below
     dropped = 0
     for k in range(n):
+        if not steep[k]:
+            continue
         after = k + 1 if k + 1 < n else 0
         r, r_before, r_after = distance[k], distance[k - 1], distance[after]
-        up, down = r_after - r, r - r_before  # NaN fails the test below
+        up, down = r_after - r, r - r_before
         if not (min(up, down) > step_m or max(up, down) < -step_m):
             continue
         if not (r_before > 0.0 and r > 0.0 and r_after > 0.0 and math.isfinite(up + down)):
@@ -70,4 +80,37 @@ def drop_mixed(
             continue
         kept[k] = math.nan
         dropped += 1
+    return dropped
+
+
+@njit(cache=True, nogil=True)
+def drop_own(
+    bearing: Any, distance: Any, x_m: float, y_m: float, yaw_rad: float, polygon: Any, too_close_m: float, kept: Any
+) -> int:
+    """Copy (N,) distances into kept (N,), with NaN for those that end in a polygon (V, 2); returns how many.
+
+    x_m, y_m, yaw_rad: the sensor in the polygon's frame.  too_close_m: where -inf ends; NaN: nowhere.
+    Where no distance is within reach of the polygon nothing is written, and -1 is returned.
+    """
+    reach = 0.0
+    for k in range(len(polygon)):
+        reach = max(reach, math.hypot(polygon[k, 0], polygon[k, 1]))
+    reach += math.hypot(x_m, y_m)
+    near = 0
+    for k in range(len(distance)):
+        near += distance[k] <= reach
+    if near == 0:
+        return -1
+    dropped = 0
+    for k in range(len(distance)):
+        r = distance[k]
+        kept[k] = r
+        if r == -math.inf:
+            r = too_close_m
+        if not 0.0 <= r <= reach:
+            continue
+        turn = bearing[k] + yaw_rad
+        if point_in_polygon(x_m + r * math.cos(turn), y_m + r * math.sin(turn), polygon):
+            kept[k] = math.nan
+            dropped += 1
     return dropped

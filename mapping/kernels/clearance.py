@@ -10,6 +10,10 @@ lives on that: in each row the place where a new or lost obstacle's interval mus
 row, away from the obstacle, until its Voronoi region (which is convex) has ended. Work: the cells that change, a few
 steps for each row in which that region is alive.
 
+With a reach, distances beyond it are not kept: such cells have FAR and NO_SITE. Then what one obstacle rules lies in a
+disc; a new one is held against every cell of it, and after losses the blocks within reach of them are looked through
+for cells without an obstacle. Work: the discs, whatever the size of the map.
+
     obstacle (R, C) uint8    columns (C, W) uint64, bit r of a column's W words: an obstacle in row r
     squared  (R, C) int32    FAR where there is no obstacle at all
     site     (R, C) int32    the nearest obstacle cell, row << 16 | column; NO_SITE where there is none
@@ -27,6 +31,8 @@ NO_SITE = -1
 NO_ROW = -30_000  # in `nearest_row`: no obstacle in this column; its distance exceeds any there is
 _NONE_BELOW = 90_000
 MAX_SIDE = 20_000  # squares of distances fit 32 bits, rows and columns 16
+UNLIMITED = 1 << 15  # a reach that no distance exceeds: its square is FAR
+_BLOCK_BITS = 5  # columns that are looked through together
 
 
 @njit(cache=True, nogil=True)
@@ -49,16 +55,18 @@ def nearest_rows(obstacle: Any, nearest: Any, below: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def row_envelopes(
-    nearest: Any, row0: int, row1: int, squared: Any, site: Any, apex: Any, height: Any, begins: Any
+    nearest: Any, row0: int, row1: int, reach: int, squared: Any, site: Any, apex: Any, height: Any, begins: Any
 ) -> None:
     """squared, site of rows [row0, row1) from nearest_rows; apex, height, begins: (C + 1,) int32 work arrays."""
     cols = nearest.shape[1]
+    bound = np.int32(min(reach * reach, FAR - 1))
+    no_column = min(reach, MAX_SIDE)
     for r in range(row0, row1):
         top = -1
         for c in range(cols):
             g = np.int64(abs(r - np.int64(nearest[r, c])))
-            if g > MAX_SIDE:
-                continue  # no obstacle in this column
+            if g > no_column:
+                continue  # no obstacle in this column, or out of reach
             top = push_parabola(c, g * g, top, 0, cols, apex, height, begins)
         if top < 0:
             for c in range(cols):
@@ -72,8 +80,9 @@ def row_envelopes(
             name = np.int32(np.int32(nearest[r, here]) << 16 | here)
             for c in range(np.uint64(begins[k]), np.uint64(stop)):
                 away = np.int32(np.int32(c) - here)
-                squared[r, c] = np.int32(away * away + base)
-                site[r, c] = name
+                value = np.int32(away * away + base)
+                squared[r, c] = value if value <= bound else np.int32(FAR)
+                site[r, c] = name if value <= bound else np.int32(NO_SITE)
 
 
 @njit(cache=True, nogil=True)
@@ -295,25 +304,28 @@ def add_obstacles(new: Any, obstacle: Any, columns: Any, squared: Any, site: Any
 
 @njit(cache=True, nogil=True)
 def refill_run(
-    r: Any, p: Any, q: Any, columns: Any, squared: Any, site: Any, apex: Any, height: Any, begins: Any, rows: Any
-) -> None:
-    """Cells [p, q) of row r have lost their obstacles: their neighbours' and those in columns between are left.
+    r: Any, p: Any, q: Any, reach: Any, columns: Any, squared: Any, site: Any, apex: Any, height: Any, begins: Any,
+    rows: Any,
+) -> None:  # fmt: skip
+    """Cells [p, q) of row r have lost their obstacles: their neighbours' and those in columns between are left, as far
+    as they are within reach.
 
     rows: (C + 1,) int32 work, the row of each apex.
     """
     total_rows, cols = site.shape
-    first_col: Any = 0
-    last_col: Any = cols - 1
-    bound = np.int64(FAR)
-    if p > 0:
+    first_col: Any = max(0, p - reach)
+    last_col: Any = min(cols - 1, q - 1 + reach)
+    farthest = np.int64(min(reach * reach, FAR - 1))
+    bound = farthest
+    if p > 0 and site[r, p - 1] >= 0:
         left = np.int64(site[r, p - 1])
-        first_col = left & 0xFFFF
-        away = max(abs(p - first_col), abs(q - 1 - first_col))
-        bound = away * away + (r - (left >> 16)) * (r - (left >> 16))
-    if q < cols:
+        first_col = max(first_col, left & 0xFFFF)
+        away = max(abs(p - (left & 0xFFFF)), abs(q - 1 - (left & 0xFFFF)))
+        bound = min(bound, away * away + (r - (left >> 16)) * (r - (left >> 16)))
+    if q < cols and site[r, q] >= 0:
         right = np.int64(site[r, q])
-        last_col = right & 0xFFFF
-        away = max(abs(p - last_col), abs(q - 1 - last_col))
+        last_col = min(last_col, right & 0xFFFF)
+        away = max(abs(p - (right & 0xFFFF)), abs(q - 1 - (right & 0xFFFF)))
         bound = min(bound, away * away + (r - (right >> 16)) * (r - (right >> 16)))
     top = -1
     for c in range(first_col, last_col + 1):
@@ -321,20 +333,23 @@ def refill_run(
         left_over = bound - aside * aside
         if left_over < 0:
             continue
-        reach = min(np.int64(np.sqrt(left_over)) + 1, total_rows)
-        row = nearest_in_column(columns, c, r, reach, total_rows)
+        row = nearest_in_column(columns, c, r, min(np.int64(np.sqrt(left_over)) + 1, total_rows), total_rows)
         if row == NO_ROW:
             continue
         top = push_parabola(c, np.int64(r - row) * np.int64(r - row), top, p, q, apex, height, begins)
         if apex[top] == c:
             rows[top] = row
+    for c in range(p, q if top < 0 else p):
+        squared[r, c] = FAR
+        site[r, c] = NO_SITE
     for k in range(top + 1):
         stop = np.int64(begins[k + 1]) if k < top else q
         here, base = np.int64(apex[k]), np.int64(height[k])
         name = np.int32(np.int32(rows[k]) << 16 | np.int32(here))
         for c in range(np.int64(begins[k]), stop):
-            squared[r, c] = (c - here) * (c - here) + base
-            site[r, c] = name
+            value = (c - here) * (c - here) + base
+            squared[r, c] = value if value <= farthest else FAR
+            site[r, c] = name if value <= farthest else np.int32(NO_SITE)
 
 
 @njit(cache=True, nogil=True)
@@ -356,7 +371,7 @@ def release_row(
         first -= 1
     while stop < cols and not obstacle[site[r, stop] >> 16, site[r, stop] & 0xFFFF]:
         stop += 1
-    refill_run(r, first, stop, columns, squared, site, apex, height, begins, rows)
+    refill_run(r, first, stop, UNLIMITED, columns, squared, site, apex, height, begins, rows)
     note_span(spans, r, first, stop)
     return p
 
@@ -390,3 +405,91 @@ def remove_obstacles(
             )  # fmt: skip
             if guess < 0:
                 break
+
+
+@njit(cache=True, nogil=True)
+def half_widths(reach: int) -> Any:
+    """(reach + 1,) int32: how far a disc of that radius extends along a row that is so many rows from its centre."""
+    half = np.empty(reach + 1, np.int32)
+    width = reach
+    for away in range(reach + 1):
+        while width * width + away * away > reach * reach:
+            width -= 1
+        half[away] = width
+    return half
+
+
+@njit(cache=True, nogil=True)
+def add_within(new: Any, half: Any, obstacle: Any, columns: Any, squared: Any, site: Any, spans: Any) -> None:
+    """new: (N, 2) int32 cells, free before.  half: `half_widths` of the reach."""
+    total_rows, cols = site.shape
+    reach = half.size - 1
+    for k in range(new.shape[0]):
+        row, a = np.int64(new[k, 0]), np.int64(new[k, 1])
+        name, order = np.int32(row << 16 | a), np.int32(a << 16 | row)
+        above, below = rows_ruled(columns, row, a, total_rows)
+        for r in range(max(above, row - reach), min(below, row + reach) + 1):
+            wide = np.int64(half[abs(r - row)])
+            first, stop = max(a - wide, 0), min(a + wide + 1, cols)
+            h = np.int32((r - row) * (r - row))
+            distances, names = squared[r, first:stop], site[r, first:stop]
+            from_a, took = np.int32(first - a), np.int32(0)
+            for i in range(distances.size):
+                away = np.int32(from_a + np.int32(i))
+                value = np.int32(h + away * away)
+                was, its = distances[i], names[i]
+                its = np.int32(np.int32(its << np.int32(16)) | np.int32(its >> np.int32(16)))  # columns count first
+                nearer = (value < was) | ((value == was) & (order < its))
+                distances[i] = value if nearer else was
+                names[i] = name if nearer else names[i]
+                took += np.int32(nearer)
+            if took > 0:
+                note_span(spans, r, first, stop)
+        obstacle[row, a] = 1
+        columns[a, row >> 6] |= np.uint64(1) << np.uint64(row & 63)
+
+
+@njit(cache=True, nogil=True)
+def remove_within(
+    lost: Any, half: Any, near: Any, obstacle: Any, columns: Any, squared: Any, site: Any, spans: Any, apex: Any,
+    height: Any, begins: Any, rows: Any,
+) -> None:  # fmt: skip
+    """lost: (N, 2) int32 cells with obstacles.  near: (R, B) uint8, zeros, blocks of columns within reach of a loss."""
+    total_rows, cols = site.shape
+    reach = half.size - 1
+    top, bottom = total_rows, 0
+    for k in range(lost.shape[0]):
+        row, a = np.int64(lost[k, 0]), np.int64(lost[k, 1])
+        above, below = rows_ruled(columns, row, a, total_rows)
+        for r in range(max(above, row - reach), min(below, row + reach) + 1):
+            wide = np.int64(half[abs(r - row)])
+            for b in range(max(a - wide, 0) >> _BLOCK_BITS, (min(a + wide, cols - 1) >> _BLOCK_BITS) + 1):
+                near[r, b] = 1
+            top, bottom = min(top, r), max(bottom, r)
+    for k in range(lost.shape[0]):
+        row, a = np.int64(lost[k, 0]), np.int64(lost[k, 1])
+        obstacle[row, a] = 0
+        columns[a, row >> 6] &= ~(np.uint64(1) << np.uint64(row & 63))
+    for r in range(top, bottom + 1):
+        for b in range(near.shape[1]):
+            if near[r, b] == 0:
+                continue
+            stop = min((b + 1) << _BLOCK_BITS, cols)
+            c = b << _BLOCK_BITS
+            while c < stop:
+                if not is_orphan(site[r, c], obstacle):
+                    c += 1
+                    continue
+                first = c
+                while first > 0 and is_orphan(site[r, first - 1], obstacle):
+                    first -= 1
+                while c < cols and is_orphan(site[r, c], obstacle):
+                    c += 1
+                refill_run(r, first, c, reach, columns, squared, site, apex, height, begins, rows)
+                note_span(spans, r, first, c)
+
+
+@njit(cache=True, nogil=True)
+def is_orphan(name: Any, obstacle: Any) -> bool:
+    """Whether the obstacle that a cell names is none any more."""
+    return bool(name >= 0 and obstacle[name >> 16, name & 0xFFFF] == 0)

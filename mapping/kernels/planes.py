@@ -67,10 +67,10 @@ def squeeze(v: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def morton_keys(points: Any, corner: Any, size_m: float, key: Any) -> None:
-    """Keys (N,) of points (N, 3) on a lattice of cells of size_m whose first corner is given."""
+def morton_keys(points: Any, corner: Any, size_m: float, first: int, last: int, key: Any) -> None:
+    """Keys (N,) of points (N, 3), from first to last - 1, on a lattice of cells of size_m with its first corner."""
     top = (1 << BITS) - 1
-    for k in range(points.shape[0]):
+    for k in range(first, last):
         i = min(max(math.floor((points[k, 0] - corner[0]) / size_m), 0), top)
         j = min(max(math.floor((points[k, 1] - corner[1]) / size_m), 0), top)
         h = min(max(math.floor((points[k, 2] - corner[2]) / size_m), 0), top)
@@ -79,59 +79,79 @@ def morton_keys(points: Any, corner: Any, size_m: float, key: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def sort_by_key(key: Any) -> Any:
-    """(order, sorted keys): stable radix sort of keys >= 0, eleven bits a pass."""
+    """(order, sorted keys): stable radix sort of keys >= 0, eleven bits a pass.
+
+    Key and place go in one number where both fit, which halves what is moved.
+    """
     n = key.size
-    order, other = np.arange(n), np.empty(n, np.int64)
-    now, after = key.copy(), np.empty(n, np.int64)
     most = 0
     for k in range(n):
         most = max(most, key[k])
-    shift = 0
-    while (most >> shift) > 0:
-        start = np.zeros(2049, np.int64)
+    places = 0
+    while (n >> places) > 0:
+        places += 1
+    together = (most >> (62 - places)) == 0
+    order = np.arange(0 if together else n)
+    now, after = key.copy(), np.empty(n, np.int64)
+    other = np.empty(order.size, np.int64)
+    shift, stop = 0, 0
+    while (most >> stop) > 0:
+        stop += 1
+    if together:
         for k in range(n):
-            start[((now[k] >> shift) & 2047) + 1] += 1
+            now[k] = (key[k] << places) | k
+        shift, stop = places, stop + places
+    start = np.empty(2048, np.int64)
+    while shift < stop:
+        start[:] = 0
+        for k in range(n):
+            start[(now[k] >> shift) & 2047] += 1
+        at = 0
         for b in range(2048):
-            start[b + 1] += start[b]
+            count = start[b]
+            start[b] = at
+            at += count
         for k in range(n):
             b = (now[k] >> shift) & 2047
             at = start[b]
             start[b] = at + 1
             after[at] = now[k]
-            other[at] = order[k]
+            if not together:
+                other[at] = order[k]
         now, after = after, now
         order, other = other, order
         shift += 11
+    if together:
+        order = after
+        for k in range(n):
+            order[k] = now[k] & ((1 << places) - 1)
+            now[k] >>= places
     return order, now
 
 
 @njit(cache=True, nogil=True)
-def usable(points: Any, farthest_m: float) -> Any:
-    """(N,) whether a point is finite and not beyond."""
+def usable(points: Any, farthest_m: float, low: Any, high: Any) -> Any:
+    """(N,) whether a point is finite and not beyond; low, high (3,): least and greatest coordinates of those."""
     n = points.shape[0]
     good = np.empty(n, np.bool_)
     limit = farthest_m * farthest_m
+    x0, y0, z0 = math.inf, math.inf, math.inf
+    x1, y1, z1 = -math.inf, -math.inf, -math.inf
     for k in range(n):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         good[k] = x * x + y * y + z * z <= limit  # NaN fails
+        if good[k]:
+            x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
+            x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
+    low[0], low[1], low[2] = x0, y0, z0
+    high[0], high[1], high[2] = x1, y1, z1
     return good
 
 
 @njit(cache=True, nogil=True)
-def bounds(points: Any, low: Any, high: Any) -> None:
-    """Least and greatest coordinates (3,) of at least one point (N, 3)."""
-    for a in range(3):
-        low[a], high[a] = points[0, a], points[0, a]
-    for k in range(points.shape[0]):
-        for a in range(3):
-            low[a] = min(low[a], points[k, a])
-            high[a] = max(high[a], points[k, a])
-
-
-@njit(cache=True, nogil=True)
-def gather(points: Any, order: Any, x: Any, y: Any, z: Any) -> None:
-    """Columns in sorted order."""
-    for k in range(order.size):
+def gather(points: Any, order: Any, first: int, last: int, x: Any, y: Any, z: Any) -> None:
+    """Columns in sorted order, from first to last - 1."""
+    for k in range(first, last):
         i = order[k]
         x[k], y[k], z[k] = points[i, 0], points[i, 1], points[i, 2]
 
@@ -239,7 +259,9 @@ def fit_plane(row: Any) -> Any:
     """
     a, b, c = row[XX], row[YY], row[ZZ]
     p, q, r = row[XY], row[XZ], row[YZ]
-    v = np.eye(3)
+    ax, bx, cx = 1.0, 0.0, 0.0  # the directions of a, b and c: scalars, since a small array here costs as much as
+    ay, by, cy = 0.0, 1.0, 0.0  # the turns
+    az, bz, cz = 0.0, 0.0, 1.0
     for _ in range(12):
         off = abs(p) + abs(q) + abs(r)
         if off <= 1e-15 * (abs(a) + abs(b) + abs(c)):
@@ -247,23 +269,28 @@ def fit_plane(row: Any) -> Any:
         if p != 0.0:  # turn x and y
             t, cs, sn = _turn(a, b, p)
             a, b, p, q, r = a - t * p, b + t * p, 0.0, cs * q - sn * r, sn * q + cs * r
-            _turn_columns(v, 0, 1, cs, sn)
+            ax, bx = cs * ax - sn * bx, sn * ax + cs * bx
+            ay, by = cs * ay - sn * by, sn * ay + cs * by
+            az, bz = cs * az - sn * bz, sn * az + cs * bz
         if q != 0.0:  # x and z
             t, cs, sn = _turn(a, c, q)
             a, c, q, p, r = a - t * q, c + t * q, 0.0, cs * p - sn * r, sn * p + cs * r
-            _turn_columns(v, 0, 2, cs, sn)
+            ax, cx = cs * ax - sn * cx, sn * ax + cs * cx
+            ay, cy = cs * ay - sn * cy, sn * ay + cs * cy
+            az, cz = cs * az - sn * cz, sn * az + cs * cz
         if r != 0.0:  # y and z
             t, cs, sn = _turn(b, c, r)
             b, c, r, p, q = b - t * r, c + t * r, 0.0, cs * p - sn * q, sn * p + cs * q
-            _turn_columns(v, 1, 2, cs, sn)
-    least, at = a, 0
+            bx, cx = cs * bx - sn * cx, sn * bx + cs * cx
+            by, cy = cs * by - sn * cy, sn * by + cs * cy
+            bz, cz = cs * bz - sn * cz, sn * bz + cs * cz
+    least, nx, ny, nz = a, ax, ay, az
     if b < least:
-        least, at = b, 1
+        least, nx, ny, nz = b, bx, by, bz
     if c < least:
-        least, at = c, 2
+        least, nx, ny, nz = c, cx, cy, cz
     most = max(a, b, c)
     middle = a + b + c - least - most
-    nx, ny, nz = v[0, at], v[1, at], v[2, at]
     largest = nx
     if abs(ny) > abs(largest):
         largest = ny
@@ -285,13 +312,6 @@ def _turn(a: float, b: float, p: float) -> Any:
         t = -t
     c = 1.0 / math.sqrt(t * t + 1.0)
     return t, c, t * c
-
-
-@njit(cache=True, nogil=True)
-def _turn_columns(v: Any, i: int, j: int, c: float, s: float) -> None:
-    for k in range(3):
-        f, g = v[k, i], v[k, j]
-        v[k, i], v[k, j] = c * f - s * g, s * f + c * g
 
 
 # ---------------------------------------------------------------------------------------------------------- RANSAC
@@ -443,18 +463,17 @@ def fit_cells(
 
 @njit(cache=True, nogil=True)
 def local_noise(
-    x: Any, y: Any, z: Any, key: Any, deepest: int, smallest: int, most: int, least: int, samples: int, range_m: Any,
-    sigma: Any,
+    x: Any, y: Any, z: Any, ones: Any, key: Any, deepest: int, smallest: int, most: int, least: int, samples: int,
+    range_m: Any, sigma: Any,
 ) -> Any:  # fmt: skip
     """Scatter of points about the planes of small cells, and the cells' range; returns how many were looked at.
 
     Small: the first on the way down that holds at most `most` points, or is of depth `smallest`; those with less than
-    `least` say nothing.  sigma is corrected for the three numbers that a plane takes.
+    `least` say nothing.  sigma is corrected for the three numbers that a plane takes.  ones: (N,), weights.
     """
     n = key.size
     stride = max(1, n // max(samples, 1))
     row = np.zeros(ROW)
-    ones = np.ones(n)
     found, at = 0, 0
     while at < n and found < range_m.size:
         depth, begin = 0, first_of_run(key, at, 0, 3 * deepest)
@@ -860,7 +879,7 @@ def pair_name(a: int, b: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def edges_of_sides(sides: Any, mark: Any, index: Any, edge: Any) -> None:
+def edges_of_sides(sides: Any, edge: Any) -> None:
     """Where planes end at each other: edge (E, 2) becomes (alpha, beta) of pairs a < b that do, zeros of others.
 
     sides (E, 4): of the points of a, how many lie before and behind b, clear of it, and of those of b before and behind
@@ -892,7 +911,7 @@ def label_nearest(
     every plane that ends on a table would cut a strip out of it.
 
     plane: (R, 4) n and d; rms: (R,), a tolerance grows with what a plane's own points scatter.  mark, index: pairs of
-    regions (`touching_regions`).  edge: (E, 2).  sides: (E, 4), counted here.
+    regions (`touching_regions`).  edge: (E, 2).  sides: (E, 4), counted here, or (0, 4).
     """
     near, off = np.empty(_NEAR, np.int64), np.empty(_NEAR)
     pair = np.full((_NEAR, _NEAR), -1, np.int64)
@@ -938,7 +957,7 @@ def label_nearest(
                         continue
                 at, best = i, apart
             label[k] = near[at] if at >= 0 else -1
-            if at < 0:
+            if at < 0 or sides.shape[0] == 0:
                 continue
             for i in range(count):
                 e = pair[i, at]
@@ -991,6 +1010,15 @@ def leave_out(weak: Any, number: Any) -> None:
     for k in range(number.size):
         if number[k] >= 0 and weak[number[k]]:
             number[k] = -1
+
+
+@njit(cache=True, nogil=True)
+def labels_as_given(found: Any, order: Any, usable: Any, rank: Any, label: Any) -> None:
+    """label (N,) of points as they were given, found (M,) as they were sorted; both become ranks of regions."""
+    for k in range(found.size):
+        if found[k] >= 0:
+            found[k] = rank[found[k]]
+        label[usable[order[k]]] = found[k]
 
 
 @njit(cache=True, nogil=True)
@@ -1053,37 +1081,45 @@ def outside_octagon(u: Any, v: Any) -> Any:
     """Indices of points that are not strictly inside the octagon of their extremes: all corners of the hull are."""
     n = u.size
     extreme = np.zeros(8, np.int64)
+    m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = -math.inf
     for k in range(n):
-        if u[k] < u[extreme[0]]:
-            extreme[0] = k
-        if u[k] + v[k] < u[extreme[1]] + v[extreme[1]]:
-            extreme[1] = k
-        if v[k] < v[extreme[2]]:
-            extreme[2] = k
-        if v[k] - u[k] < v[extreme[3]] - u[extreme[3]]:
-            extreme[3] = k
-        if u[k] > u[extreme[4]]:
-            extreme[4] = k
-        if u[k] + v[k] > u[extreme[5]] + v[extreme[5]]:
-            extreme[5] = k
-        if v[k] > v[extreme[6]]:
-            extreme[6] = k
-        if v[k] - u[k] > v[extreme[7]] - u[extreme[7]]:
-            extreme[7] = k
+        a, b = u[k], v[k]
+        if -a > m0:
+            m0, extreme[0] = -a, k
+        if -a - b > m1:
+            m1, extreme[1] = -a - b, k
+        if -b > m2:
+            m2, extreme[2] = -b, k
+        if a - b > m3:
+            m3, extreme[3] = a - b, k
+        if a > m4:
+            m4, extreme[4] = a, k
+        if a + b > m5:
+            m5, extreme[5] = a + b, k
+        if b > m6:
+            m6, extreme[6] = b, k
+        if b - a > m7:
+            m7, extreme[7] = b - a, k
+    side = np.zeros((8, 3))  # a point is inside where side 0 u + side 1 v > side 2, for all sides
+    for s in range(8):
+        i, j = extreme[s], extreme[(s + 1) % 8]
+        du, dv = u[j] - u[i], v[j] - v[i]
+        span = abs(du) + abs(dv)
+        if span == 0.0:
+            side[s, 2] = -1.0  # no side
+            continue
+        side[s, 0], side[s, 1] = -dv, du
+        side[s, 2] = du * v[i] - dv * u[i] + 1e-12 * span * (abs(u[i]) + abs(v[i]) + span)  # so near a side: kept
+    outside = np.zeros(n, np.bool_)
+    for s in range(8):
+        p, q, c = side[s, 0], side[s, 1], side[s, 2]
+        for k in range(n):
+            outside[k] |= p * u[k] + q * v[k] <= c
     kept = np.empty(n, np.int64)
     count = 0
     for k in range(n):
-        inside = True
-        for s in range(8):
-            i, j = extreme[s], extreme[(s + 1) % 8]
-            if i == j:
-                continue
-            if (u[j] - u[i]) * (v[k] - v[i]) - (v[j] - v[i]) * (u[k] - u[i]) <= 0.0:
-                inside = False
-                break
-        if not inside:
-            kept[count] = k
-            count += 1
+        kept[count] = k
+        count += outside[k]
     return kept[:count]
 
 

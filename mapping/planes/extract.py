@@ -47,6 +47,7 @@ _SAME_M: Final = 1e-6  # depths closer than this are one
 _FEWEST_STEPS: Final = 50
 _STEPS_SHARE: Final = 0.1  # of the sample: more different values are no steps
 _STEP_GROWTH: Final = 1.2
+_STEP_PART: Final = 5
 
 
 class Runner(Protocol):
@@ -221,20 +222,21 @@ def extract_planes(
         raise ValueError("sensor_m is (3,) and finite")
     chosen = rules or PlaneRules()
     moved = np.ascontiguousarray(given - sensor if np.any(sensor) else given)
-    usable = np.flatnonzero(kernels.usable(moved, FARTHEST_M))
+    box = np.empty((2, 3))
+    usable = np.flatnonzero(kernels.usable(moved, FARTHEST_M, box[0], box[1]))
     label = np.full(len(given), -1, dtype=np.int64)
     if len(usable) < chosen.min_points:
         return _none(label, chosen.noise or RangeNoise(1.0))
     cloud = moved if len(usable) == len(moved) else moved[usable]
-    return _Extraction(cloud, chosen, run).planes(usable, label, sensor)
+    return _Extraction(cloud, box, chosen, run).planes(usable, label, sensor)
 
 
 class _Extraction:
     """One cloud on its way; attributes are what the steps hand on."""
 
-    def __init__(self, points: F64, rules: PlaneRules, run: Runner) -> None:
+    def __init__(self, points: F64, box: F64, rules: PlaneRules, run: Runner) -> None:
         self.rules, self.run = rules, run
-        self._sort(points)
+        self._sort(points, box)
         self.vector = rules.vector(self.noise)
         kernels.weigh(self.x, self.y, self.z, self.vector, self.weight)
 
@@ -259,11 +261,10 @@ class _Extraction:
             found, sums = self._label_by_book(region, sums)
         return self._result(found, sums, region, usable, label, sensor)
 
-    def _sort(self, points: F64) -> None:
-        """Steps 1 and 2; the lattice stands still in the frame, whatever points there are."""
+    def _sort(self, points: F64, box: F64) -> None:
+        """Steps 1 and 2; the lattice stands still in the frame, whatever points there are. box (2, 3): their bounds."""
         rules = self.rules
-        low, high = np.empty(3), np.empty(3)
-        kernels.bounds(points, low, high)
+        low, high = box
         finest = rules.cell_m / 2**rules.finer
         self.deepest = rules.coarser + rules.finer
         while float((high - low).max()) / finest >= 2 ** (kernels.BITS - 1) - 2**self.deepest:
@@ -277,20 +278,23 @@ class _Extraction:
         largest = finest * 2**self.deepest
         corner = np.floor(low / largest) * largest
         key = np.empty(len(points), dtype=np.int64)
-        kernels.morton_keys(points, corner, finest, key)
+        cut = np.linspace(0, len(points), _CHUNKS + 1).astype(np.int64)
+        list(self.run(lambda k: kernels.morton_keys(points, corner, finest, cut[k], cut[k + 1], key), range(_CHUNKS)))
         self.order, self.key = kernels.sort_by_key(key)
-        self.x, self.y, self.z, self.weight = (np.empty(len(points)) for _ in range(4))
-        kernels.gather(points, self.order, self.x, self.y, self.z)
+        self.x, self.y, self.z, self.weight = np.empty((4, len(points)))
+        columns = (self.x, self.y, self.z)
+        list(self.run(lambda k: kernels.gather(points, self.order, cut[k], cut[k + 1], *columns), range(_CHUNKS)))
         self.noise = rules.noise or self._noise()
 
     def _noise(self) -> RangeNoise:
         """From the scatter in small cells, the smallest that are large against the noise they tell."""
         range_m, sigma = np.empty(2 * _NOISE_SAMPLES), np.empty(2 * _NOISE_SAMPLES)
         size = self.rules.cell_m / 2 ** (self.deepest - self.book_depth)
+        self.weight[:] = 1.0
         for smallest in range(self.deepest, -1, -1):
             found = kernels.local_noise(
-                self.x, self.y, self.z, self.key, self.deepest, smallest, _NOISE_MOST, _NOISE_LEAST, _NOISE_SAMPLES,
-                range_m, sigma,
+                self.x, self.y, self.z, self.weight, self.key, self.deepest, smallest, _NOISE_MOST, _NOISE_LEAST,
+                _NOISE_SAMPLES, range_m, sigma,
             )  # fmt: skip
             if found and _usual(sigma[:found]) * _NOISE_CELL <= size:
                 break
@@ -359,20 +363,21 @@ class _Extraction:
         cut = np.linspace(0, len(region), _CHUNKS + 1).astype(np.int64)
         mark, index, pairs = kernels.touching_regions(region, first, neighbour)
         edge = np.zeros((pairs, 2))
-        for _ in range(_ROUNDS):
+        for turn in range(_ROUNDS):
             plane = sums[:, kernels.NX : kernels.D + 1].copy()
             rms = kernels.rms_of(sums)
 
-            def work(part: int, plane: F64 = plane, rms: F64 = rms, label: I64 = label) -> I64:
-                sides = np.zeros((pairs, 4), dtype=np.int64)
+            def work(part: int, plane: F64 = plane, rms: F64 = rms, turn: int = turn) -> I64:
+                sides = np.zeros((pairs if turn == 0 else 0, 4), dtype=np.int64)
                 kernels.label_nearest(
                     self.x, self.y, self.z, self.begin, self.end, region, first, neighbour, plane, rms, self.vector,
                     mark, index, edge, int(cut[part]), int(cut[part + 1]), label, sides,
                 )  # fmt: skip
                 return sides
 
-            sides = sum(self.run(work, range(_CHUNKS)))
-            kernels.edges_of_sides(sides, mark, index, edge)
+            sides = list(self.run(work, range(_CHUNKS)))
+            if turn == 0:
+                kernels.edges_of_sides(np.sum(sides, axis=0), edge)
             kernels.sums_of_labels(self.x, self.y, self.z, self.weight, label, sums[:, 1:4].copy(), sums)
             weak = sums[:, kernels.COUNT] < least
             if np.any(weak):
@@ -390,8 +395,7 @@ class _Extraction:
         rank[big] = np.arange(len(big))
         sums = sums[big]
         cells = np.bincount(rank[region[region >= 0]], minlength=len(sums)) if len(sums) else np.zeros(0, np.int64)
-        sorted_label = np.where(found >= 0, rank[found], -1) if len(sums) else found
-        label[usable[self.order]] = sorted_label
+        kernels.labels_as_given(found, self.order, usable, rank, label)
         weight = np.maximum(sums[:, kernels.WEIGHT], 1e-300)
         normal, centre = sums[:, kernels.NX : kernels.NZ + 1].copy(), sums[:, kernels.CX : kernels.CZ + 1].copy()
         s = sums[:, kernels.XX : kernels.ZZ + 1] / weight[:, None]
@@ -399,7 +403,7 @@ class _Extraction:
         distance = np.einsum("pi,pi->p", normal, centre)
         normal[distance < 0.0] *= -1.0
         rms = np.sqrt(np.maximum(np.einsum("pi,pij,pj->p", normal, covariance, normal), 0.0))
-        polygon = self._polygons(sorted_label, normal, centre)
+        polygon = self._polygons(found, normal, centre)
         centre += sensor
         distance = np.einsum("pi,pi->p", normal, centre)
         if np.any(sensor):
@@ -472,7 +476,11 @@ def depth_step_per_m2(x: F64, y: F64, z: F64) -> float:
     They do if one coordinate takes few values and the gaps between these grow with it about as its square.
     """
     for column in (z, x, y):
-        sample = np.sort(np.abs(column[:: max(1, len(column) // _STEP_SAMPLES)]))
+        sample = np.abs(column[:: max(1, len(column) // _STEP_SAMPLES)])
+        part = np.sort(sample[::_STEP_PART])
+        if np.count_nonzero(np.diff(part) > _SAME_M) > _STEPS_SHARE * len(sample):
+            continue  # a part of the sample has too many values: no need to sort it all
+        sample.sort()
         value = sample[np.concatenate(([True], np.diff(sample) > _SAME_M))]
         if not _FEWEST_STEPS <= len(value) <= _STEPS_SHARE * len(sample):
             continue

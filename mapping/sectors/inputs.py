@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.frames import Pose2
-from mapping.sectors.footprint import in_polygon
+from mapping.kernels import beams as kernels
 from mapping.sectors.sight import Sight, arc_of_cone, end_points, median_spacing, sight_of_beams, sight_of_cone
 
 F64 = NDArray[np.float64]
@@ -72,25 +72,17 @@ def without_self(
 ) -> F64:
     """(N,) ranges in which what ends on the vehicle itself is invalid: it is no obstacle and frees nothing.
 
-    too_close_m: where a map would put what is too close (-inf); None: such beams are left as they are.
+    footprint: (V, 2) corners in the base frame.  too_close_m: where a map would put what is too close (-inf); None:
+    such beams are left as they are.  Returns range_m itself if nothing ends there. Raises ValueError if shapes differ.
     """
-    reach_m = float(np.hypot(footprint[:, 0], footprint[:, 1]).max()) + math.hypot(
-        base_from_sensor.x_m, base_from_sensor.y_m
-    )
-    if not (range_m <= reach_m).any():
-        return range_m
-    if too_close_m is not None:
-        ends_m = np.where(np.isneginf(range_m), too_close_m, range_m)
-        cleaned = without_self(bearing_rad, ends_m, base_from_sensor, footprint)
-        return range_m if cleaned is ends_m else np.where(np.isnan(cleaned), np.nan, range_m)
-    near = np.flatnonzero(np.isfinite(range_m) & (range_m >= 0.0) & (range_m <= reach_m))
-    if len(near) == 0:
-        return range_m
-    r, a = range_m[near], bearing_rad[near]
-    own = in_polygon(base_from_sensor.apply(np.stack((r * np.cos(a), r * np.sin(a)), axis=-1)), footprint)
-    cleaned = range_m.copy()
-    cleaned[near[own]] = np.nan
-    return cleaned
+    bearing, ranges = np.ascontiguousarray(bearing_rad), np.ascontiguousarray(range_m)
+    if bearing.shape != ranges.shape or ranges.ndim != 1:
+        raise ValueError(f"bearings and ranges must be (N,) alike, got {bearing.shape} and {ranges.shape}")
+    cleaned = np.empty_like(ranges)
+    sensor = base_from_sensor
+    nowhere = math.nan if too_close_m is None else float(too_close_m)
+    dropped = kernels.drop_own(bearing, ranges, sensor.x_m, sensor.y_m, sensor.yaw_rad, footprint, nowhere, cleaned)
+    return cleaned if dropped > 0 else range_m
 
 
 def see_beams(

@@ -116,7 +116,9 @@ def list_saved(
 
 @app.command()
 def info(
-    file: Annotated[Path | None, typer.Argument(help="A .umfeld or .yaml file; without one, the live map.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="A name from `umfeld map list`, a .umfeld or a .yaml file; none: the live map.")
+    ] = None,
     *,
     connect: Connect = None,
     config: Config = None,
@@ -125,26 +127,49 @@ def info(
 ) -> None:
     """About a map: size, cells, who wrote it.
 
-    Example: umfeld map info kitchen.umfeld --json
+    Example: umfeld map info kitchen --json
     """
-    if file is None:
+    if name is None:
         with _client(connect, config) as client:
             _report(client.call(_base(client, robot), "map_info"), as_json)
         return
-    document: dict[str, Any] = {}
-    if _is_store(file):
-        from service.store import check_file
-
-        with _open(file) as opened:
-            document = opened.info()
-        document["check"] = check_file(file) or "ok"
-        if "occupancy" in document["layers"]:
-            document["grid"] = _grid_info(_image(file))
+    file = Path(name)
+    if not file.exists() and file.name == name and not file.suffix:  # no file: one of the daemon's maps
+        with _client(connect, config) as client:
+            entry = _saved_map(client.call(_base(client, robot), "list_maps")["maps"], name)
+        file = Path(entry["path"])
+        if not file.exists():  # the daemon runs elsewhere: what it says of it is all there is
+            document = dict(entry) | {"check": entry.get("trouble") or "ok"}
+        else:
+            document = _info_of_file(file)
     else:
-        document = {"path": str(file), "check": "ok", "grid": _grid_info(_image(file))}
+        document = _info_of_file(file)
     _report(document, as_json)
     if document["check"] != "ok":
         raise typer.Exit(1)
+
+
+def _saved_map(maps: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
+    """The entry of that name in the daemon's list."""
+    for entry in maps:
+        if entry["name"] == name:
+            return entry
+    known = ", ".join(sorted(str(entry["name"]) for entry in maps)) or "none"
+    raise WrongUsage(f"{name}: is neither a file nor one of the daemon's maps ({known})")
+
+
+def _info_of_file(file: Path) -> dict[str, Any]:
+    """What a map file, or a map server's pair, says of itself; `check` is "ok" or what is wrong."""
+    if not _is_store(file):
+        return {"path": str(file), "check": "ok", "grid": _grid_info(_image(file))}
+    from service.store import check_file
+
+    with _open(file) as opened:
+        document: dict[str, Any] = opened.info()
+    document["check"] = check_file(file) or "ok"
+    if "occupancy" in document["layers"]:
+        document["grid"] = _grid_info(_image(file))
+    return document
 
 
 @app.command()

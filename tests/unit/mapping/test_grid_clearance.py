@@ -111,6 +111,31 @@ def test_an_updated_field_is_the_field_made_anew(mask: Mask, seed: int, tall: bo
         assert not np.any((before != field.site) & ~inside)
 
 
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(masks(), st.integers(0, 2**32 - 1), st.booleans(), st.integers(0, 30))
+def test_a_field_with_a_reach_is_the_whole_one_cut_off(mask: Mask, seed: int, tall: bool, reach: int) -> None:
+    """Made and over six changes; what changed is told."""
+    rng = np.random.default_rng(seed)
+    mask = np.repeat(mask, 4, axis=0) if tall else mask
+    field, whole = DistanceField(mask, reach_cells=reach), DistanceField(mask)
+    for _ in range(7):
+        far = whole.squared > reach * reach
+        assert np.array_equal(field.squared, np.where(far, FAR, whole.squared))
+        assert np.array_equal(field.site, np.where(far, -1, whole.site))
+        before, change = field.site.copy(), change_of(whole, rng)
+        spans = field.update(*change)
+        whole.update(*change)
+        assert np.array_equal(field.obstacle, whole.obstacle)
+        cols = np.arange(field.shape[1])
+        inside = (cols >= spans[:, :1]) & (cols < spans[:, 1:])
+        assert not np.any((before != field.site) & ~inside)
+
+
+def test_a_reach_below_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="reach"):
+        DistanceField(np.eye(3, dtype=np.bool_), reach_cells=-1)
+
+
 def test_the_order_of_a_change_does_not_matter() -> None:
     mask = np.zeros((60, 70), dtype=np.bool_)
     mask[10, 5:50] = True

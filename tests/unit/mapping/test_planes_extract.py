@@ -56,6 +56,36 @@ def room(sigma_m: float = 0.006, clutter: int = 800) -> tuple[F64, I64]:
     return np.concatenate((points, strays))[order], np.concatenate((wall, np.full(clutter, -1)))[order]
 
 
+def test_a_blunt_edge_is_drawn_where_it_is() -> None:
+    """Two planes that meet at 23 degrees, and noise along the rays: points near the edge lie within the tolerance of
+    both, and belong to the side that they lie on."""
+    random = np.random.default_rng(11)
+    slope = math.radians(23.0)
+    left = patch((2.0, 0.0, -0.5), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), 0.012)
+    right = patch((2.0, 0.0, -0.5), (0.6 * math.sin(slope), -0.6 * math.cos(slope), 0.0), (0.0, 0.0, 1.0), 0.012)
+    points = np.concatenate((left, right))
+    side = np.repeat((0, 1), (len(left), len(right)))
+    points *= 1.0 + random.normal(0.0, 0.004, (len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    planes = extract_planes(points)
+    assert len(planes) == 2
+    near = np.abs(points[:, 1]) < 0.1
+    assert np.mean(planes.label[near] == side[near]) > 0.95  # 0.70 by distance alone
+    assert np.mean(planes.label == side) > 0.98
+
+
+def test_a_shelf_does_not_end_the_wall_that_it_meets() -> None:
+    """Of two planes that do not both end where they meet, the distance counts, and the larger one's cells come first:
+    a shelf cuts no strip out of its wall."""
+    random = np.random.default_rng(12)
+    wall = patch((2.0, -1.0, -1.0), (0.0, 2.0, 0.0), (0.0, 0.0, 2.0), 0.015)
+    shelf = patch((1.5, -0.5, 0.4), (0.5, 0.0, -0.09), (0.0, 1.0, 0.0), 0.015)
+    points = np.concatenate((wall, shelf))
+    points *= 1.0 + random.normal(0.0, 0.004, (len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    planes = extract_planes(points)
+    assert len(planes) == 2
+    assert np.mean(planes.label[: len(wall)] == 0) > 0.98
+
+
 def same(a: Planes, b: Planes) -> bool:
     fields = ("normal", "distance_m", "centre_m", "covariance", "count", "cells", "rms_m", "label")
     outlines = all(np.array_equal(p, q) for p, q in zip(a.polygon, b.polygon))
@@ -186,7 +216,9 @@ def fitted_cells(points: F64, *, deepest: int, book_depth: int, rules: PlaneRule
     """Key, row, begin, end, level of cells of 0.1 m at the deepest."""
     key = np.empty(len(points), dtype=np.int64)
     size = 0.1
-    kernels.morton_keys(points, np.floor(points.min(axis=0) / (size * 2**deepest)) * size * 2**deepest, size, key)
+    kernels.morton_keys(
+        points, np.floor(points.min(axis=0) / (size * 2**deepest)) * size * 2**deepest, size, 0, len(points), key
+    )
     order, key = kernels.sort_by_key(key)
     x, y, z = points[order].T.copy()
     n = len(points)
