@@ -210,7 +210,7 @@ def _main() -> None:
 def _clearance() -> None:
     from mapping.grids.clearance import DistanceField
 
-    DistanceField(np.eye(3, dtype=np.bool_)).update([(0, 1), (0, 2)], [(0, 0), (1, 1)])
+    DistanceField(np.eye(3, dtype=np.bool_), reach_cells=2).update([(0, 1), (0, 2)], [(0, 0), (1, 1)])
 
 
 def _footprint(config: Config) -> None:

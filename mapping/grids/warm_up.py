@@ -11,6 +11,7 @@ from mapping.grids.beam_model import beams_of_scan
 from mapping.grids.clearance import DistanceField, clearance_layer
 from mapping.grids.evidence import Model
 from mapping.grids.occupancy import OccupancyGrid
+from mapping.kernels.beams import drop_own
 from mapping.mixed_pixels import without_mixed_pixels
 from mapping.scan import Scan
 
@@ -21,6 +22,7 @@ def warm_up(model: Model = "counters") -> None:
     ranges = np.array([1.0, 1.0, np.inf, 2.0, 1.0, np.nan, -np.inf, 1.0, 1.0])
     grid = OccupancyGrid(model=model, max_tiles=16)
     ranges, _ = without_mixed_pixels(bearing, ranges)
+    drop_own(bearing, ranges, 0.0, 0.0, 0.0, np.eye(3, 2), math.nan, np.empty_like(ranges))
     grid.insert_scan(Pose2(), bearing, ranges, range_max_m=2.0, range_min_m=0.1)
     for drift_m in (0.0, 1.0):  # as a fan, and line by line
         poses = np.stack(

@@ -430,7 +430,8 @@ def add_within(new: Any, half: Any, obstacle: Any, columns: Any, squared: Any, s
         above, below = rows_ruled(columns, row, a, total_rows)
         for r in range(max(above, row - reach), min(below, row + reach) + 1):
             wide = np.int64(half[abs(r - row)])
-            first, stop = max(a - wide, 0), min(a + wide + 1, cols)
+            first: Any = max(a - wide, 0)
+            stop: Any = min(a + wide + 1, cols)
             h = np.int32((r - row) * (r - row))
             distances, names = squared[r, first:stop], site[r, first:stop]
             from_a, took = np.int32(first - a), np.int32(0)
@@ -463,7 +464,9 @@ def remove_within(
         above, below = rows_ruled(columns, row, a, total_rows)
         for r in range(max(above, row - reach), min(below, row + reach) + 1):
             wide = np.int64(half[abs(r - row)])
-            for b in range(max(a - wide, 0) >> _BLOCK_BITS, (min(a + wide, cols - 1) >> _BLOCK_BITS) + 1):
+            left: Any = max(a - wide, 0)
+            right: Any = min(a + wide, cols - 1)
+            for b in range(left >> _BLOCK_BITS, (right >> _BLOCK_BITS) + 1):
                 near[r, b] = 1
             top, bottom = min(top, r), max(bottom, r)
     for k in range(lost.shape[0]):

@@ -75,13 +75,16 @@ def without_self(
     footprint: (V, 2) corners in the base frame.  too_close_m: where a map would put what is too close (-inf); None:
     such beams are left as they are.  Returns range_m itself if nothing ends there. Raises ValueError if shapes differ.
     """
-    bearing, ranges = np.ascontiguousarray(bearing_rad), np.ascontiguousarray(range_m)
+    bearing, ranges = (
+        np.ascontiguousarray(bearing_rad, dtype=np.float64),
+        np.ascontiguousarray(range_m, dtype=np.float64),
+    )
     if bearing.shape != ranges.shape or ranges.ndim != 1:
         raise ValueError(f"bearings and ranges must be (N,) alike, got {bearing.shape} and {ranges.shape}")
     cleaned = np.empty_like(ranges)
-    sensor = base_from_sensor
+    sensor, outline = base_from_sensor, np.ascontiguousarray(footprint, dtype=np.float64)
     nowhere = math.nan if too_close_m is None else float(too_close_m)
-    dropped = kernels.drop_own(bearing, ranges, sensor.x_m, sensor.y_m, sensor.yaw_rad, footprint, nowhere, cleaned)
+    dropped = kernels.drop_own(bearing, ranges, sensor.x_m, sensor.y_m, sensor.yaw_rad, outline, nowhere, cleaned)
     return cleaned if dropped > 0 else range_m
 
 
