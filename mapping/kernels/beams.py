@@ -101,6 +101,7 @@ def drop_own(
         near += distance[k] <= reach
     if near == 0:
         return -1
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     dropped = 0
     for k in range(len(distance)):
         r = distance[k]
@@ -109,8 +110,8 @@ def drop_own(
             r = too_close_m
         if not 0.0 <= r <= reach:
             continue
-        turn = bearing[k] + yaw_rad
-        if point_in_polygon(x_m + r * math.cos(turn), y_m + r * math.sin(turn), polygon):
+        along, across = r * math.cos(bearing[k]), r * math.sin(bearing[k])
+        if point_in_polygon(x_m + c * along - s * across, y_m + s * along + c * across, polygon):
             kept[k] = math.nan
             dropped += 1
     return dropped

@@ -96,6 +96,13 @@ def test_save_list_load_info_of_a_daemon(umfeld: Run, endpoint: str) -> None:
     assert "one word" in err
     code, out, _ = umfeld("info", "--connect", endpoint)
     assert out.splitlines() == ["rows: 3", "grid.columns: 4"]
+    code, out, _ = umfeld("info", "kitchen", "--connect", endpoint, "--json")  # a name, as `map list` tells them
+    about = json.loads(out)
+    assert code == 0
+    assert (about["check"], about["grid"]["rows"], about["path"]) == ("ok", 3, receipt["path"])
+    code, out, err = umfeld("info", "attic", "--connect", endpoint)
+    assert (code, out) == (2, "")
+    assert "(kitchen)" in err
 
 
 def test_export_of_the_live_grid(umfeld: Run, endpoint: str, tmp_path: Path) -> None:
