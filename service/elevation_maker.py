@@ -136,8 +136,7 @@ def elevation_fields(elevation: Elevation, *, version: int, frame: str = "map") 
 
     Layers are rows of cells, the lowest row first; null: not known. ground: the number of Ground.
     """
-    says = ~np.isnan(elevation.mean_m) | (elevation.ground != Ground.UNKNOWN)
-    part = _bounds(says)
+    part = known_part(elevation)
     ground, r = elevation.ground[part], elevation.resolution_m
     rows, columns = ground.shape
     return {
@@ -152,12 +151,18 @@ def elevation_fields(elevation: Elevation, *, version: int, frame: str = "map") 
             "yaw_rad": 0.0,
         },
         "cells": {kind.name.lower(): int(np.count_nonzero(ground == kind)) for kind in Ground},
-        **{name: _rows(getattr(elevation, layer)[part]) for name, layer in _LAYERS},
+        **{name: rows_of(getattr(elevation, layer)[part]) for name, layer in _LAYERS},
         "ground": ground.tolist(),
     }
 
 
-def _rows(layer: F64) -> list[list[float | None]]:
+def known_part(elevation: Elevation) -> tuple[slice, slice]:
+    """The rows and columns around the cells that say something."""
+    return _bounds(~np.isnan(elevation.mean_m) | (elevation.ground != Ground.UNKNOWN))
+
+
+def rows_of(layer: F64) -> list[list[float | None]]:
+    """A layer (R, C) as lists, to a thousandth; None where nothing is known."""
     return [[round(v, 3) + 0.0 if math.isfinite(v) else None for v in row] for row in layer.tolist()]
 
 

@@ -16,6 +16,7 @@ from mapping.grids.height import Elevation, ElevationMap, Ground, GroundRules
 from mapping.grids.octree import HALF, Octree
 from mapping.grids.quadtree import Quadtree
 from service.cloud_files import CloudTrouble, read_cloud
+from service.elevation_maker import elevation_fields, known_part, rows_of
 from service.export import load_map, patch_of
 from service.files import FileTrouble, Receipt, write_whole
 
@@ -135,19 +136,18 @@ def write_extracted(found: Extracted, path: Path) -> Receipt:
 
 
 def elevation_bytes(elevation: Elevation) -> bytes:
-    """JSON: rows of cells of each layer, the lowest row first; null where nothing is known."""
-    layers = {
-        name: [[round(v, 4) if math.isfinite(v) else None for v in row] for row in getattr(elevation, name).tolist()]
-        for name in ("min_m", "max_m", "mean_m", "variance_m2", "slope_rad", "step_m", "roughness_m")
-    }
-    names = {int(kind): kind.name.lower() for kind in Ground}
+    """The document umfeld.elevation.v1, as `map/elevation` has it, with more layers: points, min_m, max_m, variance_m2.
+
+    frame: "cloud", that of the file; a file has no stamp.
+    """
+    part = known_part(elevation)
     document = {
-        "resolution_m": elevation.resolution_m,
-        "row0": elevation.row0,
-        "col0": elevation.col0,
-        "points": elevation.count.tolist(),
-        **layers,
-        "ground": [[names[int(v)] for v in row] for row in elevation.ground.tolist()],
+        "schema": "umfeld.elevation.v1",
+        "stamp": {"sec": 0, "nanosec": 0},
+        **elevation_fields(elevation, version=0, frame="cloud"),
+        "points": elevation.count[part].tolist(),
+        **{name: rows_of(getattr(elevation, name)[part]) for name in ("min_m", "max_m")},
+        "variance_m2": [[None if math.isnan(v) else v for v in row] for row in elevation.variance_m2[part].tolist()],
     }
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 

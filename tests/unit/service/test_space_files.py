@@ -6,11 +6,13 @@ import json
 import math
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from mapping.frames import Pose2
+from mapping.grids.height import Ground
 from mapping.grids.octree import Octree
 from mapping.grids.quadtree import Quadtree
 from mapping.grids.tiles import Window
@@ -65,10 +67,15 @@ def test_an_octree_file_holds_the_room(tmp_path: Path) -> None:
 def test_an_elevation_file_has_every_layer(tmp_path: Path) -> None:
     found = elevation_of_file(cloud_file(tmp_path), resolution_m=0.2)
     document = json.loads(found.data)
-    assert document["ground"][10][10] == "traversable"
-    assert document["mean_m"][10][10] == pytest.approx(-1.0)
-    assert {"min_m", "max_m", "variance_m2", "slope_rad", "step_m", "roughness_m", "points"} <= set(document)
-    assert "step" in {value for row in document["ground"] for value in row}
+    schema = json.loads((Path(__file__).parents[3] / "docs/schemas/elevation.v1.json").read_text())
+    jsonschema.validate(document, schema, cls=jsonschema.Draft202012Validator)
+    row, col = (round((0.1 - document["origin"][axis]) / 0.2 - 0.5) for axis in ("y_m", "x_m"))
+    assert document["ground"][row][col] == Ground.TRAVERSABLE
+    assert document["height_m"][row][col] == pytest.approx(-1.0)
+    shape = (document["rows"], document["columns"])
+    for layer in ("min_m", "max_m", "variance_m2", "points", "height_m", "slope_rad", "step_m", "roughness_m"):
+        assert np.shape(document[layer]) == shape
+    assert Ground.STEP in {value for row in document["ground"] for value in row}
     below = elevation_of_file(tmp_path / "room.xyz", resolution_m=0.2, height_max_m=-0.95)
     assert below.report["step_cells"] == 0
 
