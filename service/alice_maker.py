@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mapping.scan import Scan
 from service.map_makers import MapView, Tile
 from service.outputs import DocumentOut, LookOut, Output
+from service.routes import NodeId, Passage, Ways, nearest_of
 from service.store import StoreTrouble, pack_array, unpack_array
 
 if TYPE_CHECKING:
@@ -75,6 +76,19 @@ class AliceMaker:
             ],
         }
         return [DocumentOut(KEY, self._stamp_ns, fields)]
+
+    def ways(self) -> Ways:
+        """For the call @rpc/route: straight from place to place, as the robot drove."""
+        graph = self.topo.graph()
+        at: dict[NodeId, tuple[float, float] | None] = {}
+        for node in graph.nodes:
+            x, y = node.position_m
+            at[node.number] = (float(x), float(y))
+        passages = []
+        for a, b, _, _ in graph.edges:
+            (ax, ay), (bx, by) = at[a] or (0.0, 0.0), at[b] or (0.0, 0.0)
+            passages.append(Passage(a, b, (0.5 * (ax + bx), 0.5 * (ay + by))))
+        return Ways("places", at, passages, nearest=lambda point, name: nearest_of(at, point, name, "place"))
 
     def changed_tiles(self) -> list[Tile]:
         """The whole map, an array a tile, named by (its rank, how many dimensions it has)."""

@@ -81,7 +81,7 @@ if TYPE_CHECKING:
     from service.elevation_maker import ElevationMaker
     from service.layers import ArtosLayer, BuildingLayer, PolarLayer, RectLayer
     from service.map_localiser import KnownMapLayer
-    from service.map_makers import MapMaker, MapMakers
+    from service.map_makers import MapMaker
     from service.mavlink_out import MavlinkOut
     from service.redraw import OnRedrawn
     from service.rpc import Handler
@@ -683,16 +683,6 @@ def _mount_settings(config: Config, name: str) -> MountSettings:
     )
 
 
-def maker_calls(makers: Sequence[MapMaker], slow: MapMakers) -> Iterator[tuple[str, Handler]]:
-    """Calls into the maps of the slow thread, by name; they run there."""
-    for maker in makers:
-        if maker.name == "scenes":
-            from service.scene_maker import SceneMaker
-
-            assert isinstance(maker, SceneMaker)
-            yield "where_am_i", partial(_ask, slow, maker.where_am_i)
-
-
 def closure_calls(localiser: Localiser, ask: Callable[[Callable[[], Any]], Any]) -> Iterator[tuple[str, Handler]]:
     """Calls about the closures of a daemon that does SLAM, by name. ask: runs a function on the fusion thread."""
     if isinstance(localiser, OdometryOnly):
@@ -702,10 +692,6 @@ def closure_calls(localiser: Localiser, ask: Callable[[Callable[[], Any]], Any])
     if isinstance(localiser, SlamLocaliser):
         yield "list_closures", lambda _arguments: ask(localiser.closures_told)
         yield "undo_closure", lambda arguments: ask(partial(localiser.undo, arguments))
-
-
-def _ask(slow: MapMakers, answer: Handler, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    return slow.ask(partial(answer, arguments))
 
 
 def _artos_map(config: Config, polar: Sequence[PolarLayer]) -> ArtosLayer:

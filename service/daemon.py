@@ -39,18 +39,17 @@ from service.config import Config, Loaded
 from service.errors import Trouble
 from service.live_map import SLAM, LiveMap, restore
 from service.locks import Claims
+from service.maker_calls import maker_calls
 from service.map_makers import MapMakers, SweepTap
 from service.outputs import HealthOut, Output
 from service.payloads import RobotInfo, SensorPlace
 from service.publisher import Publisher
 from service.recording import RecordedFusion, Recorder
-from service.room_maker import RoomMaker
 from service.ros import RosSettings
 from service.rpc import CallRefused
 from service.sensors import Chain, Laser
 from service.store import MapStore, Provenance
 from service.systemd import Notifier
-from service.topo_maker import TopoMaker
 from service.warm_up import StoppedWhileCompiling, warm_up
 from service.worker import Worker
 from service.zenoh_session import NetworkSettings, TlsFiles
@@ -154,12 +153,6 @@ class Daemon:
         makers = assemble.map_makers(config, self._sensors)
         self._makers = MapMakers(makers, self._publisher.offer, now_ns=self._clock.now_ns)
         self._ground = assemble.sector_ground(config, makers)
-        for maker in makers:
-            if isinstance(maker, TopoMaker):
-                self._publisher.calls.register("route", partial(self._on_route, maker))
-            elif isinstance(maker, RoomMaker):
-                self._publisher.calls.register("plan", partial(self._on_plan, maker))
-                self._publisher.calls.register("name_room", partial(self._on_name_room, maker))
         if store is not None:
             self._makers.restore(store.load_tiles)
         background = Background()
@@ -204,7 +197,7 @@ class Daemon:
             assert isinstance(localiser, KnownMapLocaliser)
             self._publisher.calls.register("relocalise", partial(relocalise, localiser, self._worker.ask))
         closure_calls = assemble.closure_calls(localiser, self._worker.ask)
-        for name, answer in (*closure_calls, *assemble.maker_calls(makers, self._makers)):
+        for name, answer in (*closure_calls, *maker_calls(makers, self._makers, self._publisher.offer)):
             self._publisher.calls.register(name, answer)
         self._publisher.calls.register("record_start", self._on_record_start)
         self._publisher.calls.register("record_stop", lambda _arguments: self._end_recording())
@@ -280,31 +273,6 @@ class Daemon:
         return [] if trouble is None else [trouble]
 
     # --- recording
-
-    def _on_route(self, maker: TopoMaker, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        return self._makers.ask(partial(maker.route, arguments))
-
-    def _on_plan(self, maker: RoomMaker, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Plan, and tell everybody the way."""
-
-        def work() -> Mapping[str, Any]:
-            answer = maker.plan(arguments)
-            if (told := maker.planned()) is not None:
-                self._publisher.offer(told)
-            return answer
-
-        return self._makers.ask(work)
-
-    def _on_name_room(self, maker: RoomMaker, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Name a room, and tell everybody at once."""
-
-        def work() -> Mapping[str, Any]:
-            answer = maker.name_room(arguments)
-            for output in maker.news():
-                self._publisher.offer(output)
-            return answer
-
-        return self._makers.ask(work)
 
     def _on_record_start(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Begin a recording on request; every device is set up anew, so that its set-up is in it."""

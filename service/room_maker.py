@@ -23,6 +23,7 @@ from mapping.scan import Scan
 from service.map_makers import MapView, Rect, Tile
 from service.outputs import DocumentOut, Output
 from service.room_outlines import RoomOutlines
+from service.routes import NEAR_M, NodeId, Passage, Ways
 from service.rpc import CallRefused
 
 if TYPE_CHECKING:
@@ -230,6 +231,29 @@ class RoomMaker:
         self._ids, self._middles = {}, {}
 
     # --- calls, between two turns of the makers' thread
+
+    def ways(self) -> Ways:
+        """For the call @rpc/route: from door to door, straight on."""
+        if self._found is None:
+            raise CallRefused("no rooms are known yet: let the robot see some free space first")
+        told = self._fields()
+        at: dict[NodeId, tuple[float, float]] = {room["id"]: tuple(room["position"]) for room in told["rooms"]}
+        doors = [Passage(a, b, tuple(door["position"])) for door in told["doors"] for a, b in [door["rooms"]]]
+        names: dict[str, NodeId] = {name: k for k, name in self._book.names.items() if k in at}
+        return Ways("rooms", at, doors, through=True, nearest=self._room_at, names=names)
+
+    def _room_at(self, point: tuple[float, float], name: str) -> int:
+        """The room in which a position lies, or the nearest within a metre."""
+        assert self._grid is not None
+        assert self._found is not None
+        d, rooms = self._grid.resolution_m, sorted(self._ids)
+        rows, cols = np.nonzero(np.isin(self._found.labels, rooms))
+        x, y = (cols + self._grid.col0 + 0.5) * d, (rows + self._grid.row0 + 0.5) * d
+        away = np.hypot(x - point[0], y - point[1])
+        nearest = int(away.argmin()) if away.size else -1
+        if nearest < 0 or away[nearest] > NEAR_M:
+            raise CallRefused(f'"{name}": no room within {NEAR_M:g} m of {list(point)}')
+        return self._ids[int(self._found.labels[rows[nearest], cols[nearest]])]
 
     def name_room(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """The call @rpc/name_room: {"id": 3, "name": "kitchen"}; an empty name takes it away.

@@ -7,8 +7,8 @@ of a grid may never add what is not free. Where a plan has too many corners it i
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,13 +18,12 @@ from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service.map_makers import MapView, Tile
 from service.outputs import DocumentOut, Output
+from service.routes import NEAR_M, NodeId, Passage, Ways
 from service.rpc import CallRefused
 
 if TYPE_CHECKING:
-    import networkx as nx
     from shapely.geometry import MultiPolygon
 
-    from mapping.topology.queries import Route
     from mapping.topology.regions import RegionMap
 
 F64 = NDArray[np.float64]
@@ -72,11 +71,11 @@ class TopoMaker:
         """The grid comes back, and with it the regions."""
         self._regions, self._told = None, b""
 
-    def route(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """The call @rpc/route; see route_answer."""
+    def ways(self) -> Ways:
+        """For the call @rpc/route."""
         if self._regions is None or not self._regions.regions:
             raise CallRefused("no regions are known yet: let the robot see some free space first")
-        return route_answer(self._regions, arguments)
+        return ways_of(self._regions)
 
 
 def regions_of_grid(grid: GridPatch, *, smooth_m: float) -> RegionMap:
@@ -149,93 +148,29 @@ def topo_fields(regions: RegionMap, *, door_m: float) -> dict[str, Any]:
     }
 
 
-def route_answer(regions: RegionMap, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """A route over the regions, and what happens where it fails.
-
-    arguments: "from" and "to", each a region's id or a position [x, y]; and, if wanted, "via" (a list of those, in
-    order), "avoid" (ids), "avoid_edges" (pairs of ids).  Answers nodes, length_m, stops, positions, alternatives
-    (for each edge of the route, the nodes of a way round it or null) and cut_off (what could not be reached any more
-    if that edge failed).  CallRefused says what is wrong, or that there is no way.
-    """
-    from mapping.topology.queries import NoRoute, cut_off, route, ways_round
-
-    unknown = set(arguments) - {"from", "to", "via", "avoid", "avoid_edges"}
-    if unknown:
-        raise CallRefused(f"unknown argument {sorted(unknown)[0]!r}; there are from, to, via, avoid, avoid_edges")
-    graph = regions.graph()
-    try:
-        found = route(
-            graph,
-            _place(regions, arguments.get("from"), "from"),
-            _place(regions, arguments.get("to"), "to"),
-            via=[_place(regions, entry, "via") for entry in _list(arguments, "via")],
-            avoid_nodes=[_id(entry, "avoid") for entry in _list(arguments, "avoid")],
-            avoid_edges=[_pair(entry) for entry in _list(arguments, "avoid_edges")],
-        )
-    except (NoRoute, KeyError) as error:
-        raise CallRefused(str(error.args[0])) from error
-    others = ways_round(graph, found)
-    return {
-        "nodes": list(found.nodes),
-        "length_m": round(found.length_m, 3),
-        "stops": len(found.between),
-        "positions": _positions(graph, found),
-        "alternatives": [
-            {
-                "edge": list(edge),
-                "nodes": None if other is None else list(other.nodes),
-                "length_m": None if other is None else round(other.length_m, 3),
-                "cut_off": [] if other is not None else sorted(cut_off(graph, found.nodes[0], edges=[edge])),
-            }
-            for edge, other in others.items()
-        ],
+def ways_of(regions: RegionMap) -> Ways:
+    """Regions for routes: from centre to centre through the passages."""
+    at: dict[NodeId, tuple[float, float]] = {
+        each.number: (float(each.centre_m[0]), float(each.centre_m[1])) for each in regions.regions
     }
+    passages = []
+    for each in regions.passages:
+        x, y = each.ends_m.mean(axis=0).tolist()
+        passages.append(Passage(each.a, each.b, (x, y)))
+    return Ways("regions", at, passages, nearest=partial(_region_at, regions))
 
 
-def _positions(graph: nx.Graph[int], found: Route) -> list[list[float]]:
-    """From centre to centre through the passages."""
-    points = [_rounded(graph.nodes[found.nodes[0]]["centre_m"])]
-    for a, b in found.edges:
-        points += [_rounded(graph.edges[a, b]["at_m"]), _rounded(graph.nodes[b]["centre_m"])]
-    return points
-
-
-def _place(regions: RegionMap, given: object, name: str) -> int:
-    """A region by its id or by a point in it; of a point outside all of them the nearest within 1 m."""
+def _region_at(regions: RegionMap, point: tuple[float, float], name: str) -> int:
+    """The region in which a point lies; of a point outside all of them the nearest within 1 m."""
     from shapely.geometry import Point, Polygon
 
-    if isinstance(given, int) and not isinstance(given, bool):
-        return given
-    if not (isinstance(given, Sequence) and len(given) == 2 and all(_is_number(value) for value in given)):
-        raise CallRefused(f'"{name}" is the id of a region or a position [x, y], got {json.dumps(given)}')
-    away = [(Polygon(region.corners_m).distance(Point(given)), region.number) for region in regions.regions]
+    away = [(Polygon(region.corners_m).distance(Point(point)), region.number) for region in regions.regions]
     distance, number = min(away)
-    if distance > 1.0:
-        raise CallRefused(f'"{name}": no region within 1 m of {list(given)}; the nearest is {distance:.1f} m away')
+    if distance > NEAR_M:
+        raise CallRefused(
+            f'"{name}": no region within {NEAR_M:g} m of {list(point)}; the nearest is {distance:.1f} m away'
+        )
     return number
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _id(given: object, name: str) -> int:
-    if not isinstance(given, int) or isinstance(given, bool):
-        raise CallRefused(f'"{name}" is a list of ids of regions, got {json.dumps(given)} in it')
-    return given
-
-
-def _pair(given: object) -> tuple[int, int]:
-    if not isinstance(given, list) or len(given) != 2:
-        raise CallRefused(f'"avoid_edges" is a list of pairs of ids, got {json.dumps(given)} in it')
-    return _id(given[0], "avoid_edges"), _id(given[1], "avoid_edges")
-
-
-def _list(arguments: Mapping[str, Any], name: str) -> list[object]:
-    given = arguments.get(name, [])
-    if not isinstance(given, list) or len(given) > 100:
-        raise CallRefused(f'"{name}" is a list of at most 100')
-    return given
 
 
 def _rounded(point: Any) -> list[float]:

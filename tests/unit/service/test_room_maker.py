@@ -17,6 +17,7 @@ from service.config import Config
 from service.map_makers import MapView, Rect
 from service.outputs import DocumentOut
 from service.room_maker import RoomMaker
+from service.routes import route_answer
 from service.rpc import CallRefused
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs" / "schemas" / "rooms.v1.json").read_text())
@@ -241,6 +242,23 @@ def test_names_are_told_kept_and_belong_to_one_room() -> None:
         again.restore([(0, 0, b"{")])
     with pytest.raises(ValueError, match="territory"):
         again.restore([(0, 0, b'{"next": 2, "names": {}}'), (1, 0, b"rubbish")])
+
+
+def test_routes_lead_from_room_to_room_by_id_name_or_position() -> None:
+    maker = RoomMaker(settle_turns=1)
+    with pytest.raises(CallRefused, match="no rooms"):
+        maker.ways()
+    told(maker, house())
+    maker.name_room({"id": 2, "name": "kitchen"})
+    answer = route_answer(maker.ways(), {"from": at(10, 10), "to": "kitchen"})
+    assert (answer["kind"], answer["nodes"], answer["stops"]) == ("rooms", [1, 2], 0)
+    assert answer["length_m"] == pytest.approx(5.2, abs=1.5)
+    assert [(each["edge"], each["nodes"], each["cut_off"]) for each in answer["alternatives"]] == [([1, 2], None, [2])]
+    with pytest.raises(CallRefused, match="no room within 1 m"):
+        route_answer(maker.ways(), {"from": [0.0, 0.0], "to": 1})
+    told(maker, house(door=False))
+    with pytest.raises(CallRefused, match="no way from 1 to 2"):
+        route_answer(maker.ways(), {"from": 1, "to": 2})
 
 
 def test_a_robot_whose_grid_a_laser_draws_has_rooms_without_being_told() -> None:

@@ -21,8 +21,9 @@ from service.config import Config
 from service.map_makers import MapView, Rect
 from service.outputs import DocumentOut
 from service.payloads import Encoder
+from service.routes import route_answer
 from service.rpc import CallRefused
-from service.topo_maker import TopoMaker, free_polygons, regions_of_grid, route_answer
+from service.topo_maker import TopoMaker, free_polygons, regions_of_grid, ways_of
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs" / "schemas" / "topo.v1.json").read_text())
 I8 = NDArray[np.int8]
@@ -86,7 +87,7 @@ def test_told_only_when_it_changed() -> None:
     maker.restore(())
     assert maker.changed_tiles() == []
     with pytest.raises(CallRefused, match="no regions"):
-        maker.route({"from": 0, "to": 1})
+        maker.ways()
     assert told(maker, shut) is not None
 
 
@@ -119,7 +120,7 @@ def test_no_region_holds_a_cell_that_is_not_free(seed: int, row0: int, col0: int
 
 
 def test_route_through_the_corridor() -> None:
-    regions = regions_of_grid(house(), smooth_m=0.1)
+    regions = ways_of(regions_of_grid(house(), smooth_m=0.1))
     answer = route_answer(regions, {"from": [2.0, 1.0], "to": [7.0, 1.0]})
     assert answer["stops"] == len(answer["nodes"]) - 2
     assert 8.0 < answer["length_m"] < 16.0
@@ -134,15 +135,15 @@ def test_route_through_the_corridor() -> None:
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        ({"from": 0}, '"to" is the id'),
+        ({"from": 0}, '"to" is where the route ends'),
         ({"from": 0, "to": 999}, "no node 999"),
         ({"from": 0, "to": [50.0, 50.0]}, "no region within 1 m"),
-        ({"from": 0, "to": [math.nan, 0.0]}, '"to" is the id'),
-        ({"from": True, "to": 1}, '"from" is the id'),
+        ({"from": 0, "to": [math.nan, 0.0]}, '"to" is a node'),
+        ({"from": True, "to": 1}, '"from" is a node'),
         ({"from": 0, "to": 1, "over": 3}, "unknown argument 'over'"),
         ({"from": 0, "to": 1, "via": 3}, '"via" is a list'),
-        ({"from": 0, "to": 1, "avoid": ["a"]}, '"avoid" is a list of ids'),
-        ({"from": 0, "to": 1, "avoid_edges": [[0]]}, "pairs of ids"),
+        ({"from": 0, "to": 1, "avoid": ["a"]}, '"avoid": no node a'),
+        ({"from": 0, "to": 1, "avoid_edges": [[0]]}, "pairs of nodes"),
         ({"from": 0, "to": 1, "avoid_edges": [[0, 0]]}, "no edge 0 - 0"),
     ],
 )
@@ -150,11 +151,11 @@ def test_calls_that_make_no_sense_say_why(arguments: dict[str, Any], why: str) -
     maker = TopoMaker()
     maker.make(view(house()))
     with pytest.raises(CallRefused, match=why):
-        maker.route(arguments)
+        route_answer(maker.ways(), arguments)
 
 
 def test_no_way_says_so() -> None:
-    regions = regions_of_grid(house(), smooth_m=0.1)
+    regions = ways_of(regions_of_grid(house(), smooth_m=0.1))
     answer = route_answer(regions, {"from": [2.0, 1.0], "to": [7.0, 1.0]})
     with pytest.raises(CallRefused, match="no way from"):
         route_answer(regions, {"from": [2.0, 1.0], "to": [7.0, 1.0], "avoid": answer["nodes"][1:-1]})
