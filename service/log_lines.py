@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.logs import Log, LogError, read_log
+from drivers.logs import Log, LogError, LogScan, read_log
 from mapping.frames import Pose2
 from mapping.lines.extract import LineExtractor, LineRules
 from mapping.lines.line_map import LineMap
@@ -55,6 +55,29 @@ def lines_of_log(
     return _of_run(log, every, min_seen, min_points, rules, progress)
 
 
+def line_map_of(
+    scans: Sequence[LogScan],
+    map_from_laser: Sequence[Pose2],
+    *,
+    range_max_m: float,
+    rules: LineRules | None = None,
+    progress: Progress | None = None,
+) -> tuple[LineMap, int]:
+    """The lines of scans from the poses of their laser, as a map; and how many lines there were before fusing them."""
+    extractors: dict[int, LineExtractor] = {}
+    line_map, found = LineMap(), 0
+    for index, (each, pose) in enumerate(zip(scans, map_from_laser, strict=True)):
+        key = id(each.bearing_rad)  # shared between the scans of a device
+        if key not in extractors:
+            extractors[key] = LineExtractor(each.bearing_rad, rules, range_max_m=range_max_m)
+        lines = extractors[key].extract(each.range_m)
+        found += len(lines)
+        line_map.insert(lines, pose)
+        if progress is not None and index % 64 == 0:
+            progress(index, len(scans))
+    return line_map, found
+
+
 def _of_one_scan(log: Log, number: int, rules: LineRules | None) -> LogLines:
     count = len(log.scans)
     if not -count <= number < count:
@@ -69,18 +92,9 @@ def _of_run(
     log: Log, every: int, min_seen: int, min_points: int, rules: LineRules | None, progress: Progress | None
 ) -> LogLines:
     scans = log.scans[::every]
-    extractors: dict[int, LineExtractor] = {}
-    line_map, found = LineMap(), 0
     started = time.monotonic()
-    for index, each in enumerate(scans):
-        key = id(each.bearing_rad)  # shared between the scans of a device
-        if key not in extractors:
-            extractors[key] = LineExtractor(each.bearing_rad, rules, range_max_m=log.range_max_m)
-        lines = extractors[key].extract(each.range_m)
-        found += len(lines)
-        line_map.insert(lines, Pose2(*each.laser_pose))
-        if progress is not None and index % 64 == 0:
-            progress(index, len(scans))
+    poses = [Pose2(*each.laser_pose) for each in scans]
+    line_map, found = line_map_of(scans, poses, range_max_m=log.range_max_m, rules=rules, progress=progress)
     kept = line_map.lines(min_seen=min_seen, min_count=min_points)
     map_bytes = len(line_map.to_bytes(min_seen=min_seen, min_count=min_points))
     scan_bytes = sum(4 * each.range_m.size for each in scans)

@@ -2,6 +2,7 @@
 
     trajectory.tum   stamp x y z qx qy qz qw of the robot, a line for every scan, stamps as the log writes them
     map.pgm map.yaml map.png    the occupancy grid, as map servers read it, and to look at
+    lines.geojson    the walls as lines, of scans 10 cm or 5 degrees apart
     map.umfeld       the store, which `umfeld run` and `umfeld map load` take
     report.json      counts, timings, memory; with hold_out also how well scans that were left out fit
 
@@ -25,12 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.logs import Log, LogError, LogScan, PoseKind, read_log
-from mapping.frames import Pose2
+from mapping.frames import Pose2, wrap_angle
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
+from mapping.lines.lines import Lines
 from service.errors import WrongUsage
 from service.export import image_of, save_grid, save_pgm_yaml
 from service.files import write_whole
+from service.line_files import write_lines
+from service.log_lines import line_map_of
 from service.map_import import write_grid_map
 
 F64 = NDArray[np.float64]
@@ -39,6 +43,7 @@ Progress = Callable[[int, int], None]
 OCCUPIED_FROM_PERCENT = 65  # as map servers read a map: occupied_thresh 0.65
 NEAR_M = 0.10
 BEFORE_END_M = 0.20
+APART_M, APART_RAD = 0.1, math.radians(5.0)  # of scans that add lines: as in the daemon
 
 
 class PoseSource(StrEnum):
@@ -67,6 +72,7 @@ class Built:
     scans: Sequence[LogScan]
     robot_poses: F64
     grid: OccupancyGrid
+    lines: Lines
     inserted: int
     hold_out: HoldOut | None
     seconds: dict[str, float]
@@ -111,10 +117,12 @@ def build(
     held = set(range(0, len(scans), hold_out)) if hold_out else set()
     insert_scans(grid, log, scans, robot_poses, left_out=held, progress=progress)
     mapped = time.monotonic()
+    lines = lines_of(log, scans, robot_poses, left_out=held)
+    lined = time.monotonic()
     judged = judge(grid.patch(), log, [scans[i] for i in sorted(held)], robot_poses[sorted(held)]) if held else None
     return Built(
-        log, scans, robot_poses, grid, len(scans) - len(held), judged,
-        {"read": read - started, "localise": localised - read, "map": mapped - localised},
+        log, scans, robot_poses, grid, lines, len(scans) - len(held), judged,
+        {"read": read - started, "localise": localised - read, "map": mapped - localised, "lines": lined - mapped},
         slam,
     )  # fmt: skip
 
@@ -146,6 +154,21 @@ def insert_scans(
             )
         if progress is not None and index % 64 == 0:
             progress(index, len(scans))
+
+
+def lines_of(log: Log, scans: Sequence[LogScan], robot_poses: F64, *, left_out: set[int]) -> Lines:
+    """Walls of scans whose robot stood APART_M or APART_RAD from the one before, seen by two of them at least."""
+    robot_from_laser = Pose2(*log.robot_from_laser)
+    chosen: list[int] = []
+    for index, pose in enumerate(robot_poses):
+        if index in left_out:
+            continue
+        way = np.abs(pose - robot_poses[chosen[-1]]) if chosen else np.full(3, np.inf)
+        if math.hypot(way[0], way[1]) >= APART_M or abs(wrap_angle(float(way[2]))) >= APART_RAD:
+            chosen.append(index)
+    poses = [Pose2(*robot_poses[index]) @ robot_from_laser for index in chosen]
+    line_map, _ = line_map_of([scans[index] for index in chosen], poses, range_max_m=log.range_max_m)
+    return line_map.lines(min_seen=2)
 
 
 def judge(patch: GridPatch, log: Log, scans: Sequence[LogScan], robot_poses: F64) -> HoldOut:
@@ -209,6 +232,7 @@ def write(built: Built, out: Path, *, source: PoseSource) -> dict[str, object]:
     write_whole(out / "trajectory.tum", trajectory_text(built).encode())
     receipts = save_pgm_yaml(image_of(patch), out / "map.yaml")
     receipts += save_grid(image_of(patch), out / "map.png")
+    receipts.append(write_lines(built.lines, out / "lines.geojson"))
     receipts.append(write_grid_map(built.grid, out / "map.umfeld", source=built.log.provenance.path))
     built.seconds["write"] = time.monotonic() - started
     report = report_of(built, patch, source)
@@ -244,6 +268,7 @@ def report_of(built: Built, patch: GridPatch, source: PoseSource) -> dict[str, o
         "cells": {"rows": patch.cells.shape[0], "columns": patch.cells.shape[1]},
         "free_m2": float(np.sum((patch.cells >= 0) & (patch.cells < OCCUPIED_FROM_PERCENT)) * area),
         "occupied_m2": float(np.sum(patch.cells >= OCCUPIED_FROM_PERCENT) * area),
+        "lines": len(built.lines),
         "refused_tiles": built.grid.refused_tiles,
         "seconds": {name: round(value, 3) for name, value in built.seconds.items()},
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1),

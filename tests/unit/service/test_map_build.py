@@ -12,6 +12,7 @@ import pytest
 
 from service.errors import WrongUsage
 from service.export import load_pgm_yaml
+from service.line_files import lines_of_geojson
 from service.map_build import Built, PoseSource, build, write
 
 DATA = os.environ.get("UMFELD_DATA", "")
@@ -53,6 +54,11 @@ def test_the_walls_are_where_they_are_and_every_file_is_written(room: Path, tmp_
     assert len(off) > 350  # four walls of 120 cells, less what the gap and the corners cost
     for name in ("trajectory.tum", "map.pgm", "map.yaml", "map.png", "map.umfeld", "report.json"):
         assert (tmp_path / "out" / name).stat().st_size > 0
+    walls = lines_of_geojson((tmp_path / "out" / "lines.geojson").read_bytes())
+    assert report["lines"] == len(walls) >= 5  # the gap parts the eastern one
+    ends = np.concatenate((walls.start_m, walls.end_m))
+    assert np.abs(np.abs(ends).max(axis=1) - HALF_M).max() < 0.02
+    assert 4 * 2 * HALF_M - 1.6 < walls.length_m.sum() < 4 * 2 * HALF_M
     assert json.loads((tmp_path / "out" / "report.json").read_text()) == json.loads(json.dumps(report))
     assert built.hold_out is not None
     assert built.hold_out.near_occupied > 0.99
