@@ -2,7 +2,7 @@
 
     trajectory.tum   stamp x y z qx qy qz qw of the robot, a line for every scan, stamps as the log writes them
     map.pgm map.yaml map.png    the occupancy grid, as map servers read it, and to look at
-    lines.geojson    the walls as lines, of scans 10 cm or 5 degrees apart
+    lines.geojson    the walls as lines, of scans 20 cm or 10 degrees apart
     map.umfeld       the store, which `umfeld run` and `umfeld map load` take
     report.json      counts, timings, memory; with hold_out also how well scans that were left out fit
 
@@ -43,7 +43,7 @@ Progress = Callable[[int, int], None]
 OCCUPIED_FROM_PERCENT = 65  # as map servers read a map: occupied_thresh 0.65
 NEAR_M = 0.10
 BEFORE_END_M = 0.20
-APART_M, APART_RAD = 0.1, math.radians(5.0)  # of scans that add lines: as in the daemon
+APART_M, APART_RAD = 0.2, math.radians(10.0)  # of scans that add lines: more of them add little
 
 
 class PoseSource(StrEnum):
