@@ -145,11 +145,15 @@ class Daemon:
         self._publisher = self._make_publisher()
         self._parts.callback(self._close_publisher)
         self._publisher.add_tap(self._recorder.message)
-        starting = _in_thread(
-            "router", partial(self._publisher.start, announce=False)
-        )  # takes half a second, the kernels as much
-        warm_up(config, stop_asked=self._stop_asked, meanwhile=self._notifier.still_starting)
-        starting()
+        starting = _Beside("router", partial(self._publisher.start, announce=False))  # half a second, as the kernels
+        try:
+            warm_up(
+                config,
+                stop_asked=lambda: self._stop_asked() or starting.has_failed(),
+                meanwhile=self._notifier.still_starting,
+            )
+        finally:
+            starting()  # what hindered it is told before a minute of compiling has passed
         makers = assemble.map_makers(config, self._sensors)
         self._makers = MapMakers(makers, self._publisher.offer, now_ns=self._clock.now_ns)
         self._ground = assemble.sector_ground(config, makers)
@@ -347,7 +351,7 @@ class Daemon:
         def stop(reader: WireReader[Any]) -> None:
             self._note(reader.stop(_WIRE_STOP_S))
 
-        for wait in [_in_thread(f"stop {reader.name}", partial(stop, reader)) for reader in self._readers]:
+        for wait in [_Beside(f"stop {reader.name}", partial(stop, reader)) for reader in self._readers]:
             wait()
 
     def _stop_worker(self) -> None:
@@ -453,25 +457,29 @@ def _version() -> str:
         return "unknown"
 
 
-def _in_thread(name: str, work: Callable[[], object]) -> Callable[[], None]:
-    """Run something beside us; the function returned waits for it and raises what it raised."""
-    failed: list[BaseException] = []
+class _Beside:
+    """Something that runs beside us from now on; calling it waits for the end and raises what was raised."""
 
-    def run() -> None:
+    def __init__(self, name: str, work: Callable[[], object]) -> None:
+        self._work = work
+        self._failed: list[BaseException] = []
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
         try:
-            work()
+            self._work()
         except BaseException as error:  # handed to whoever waits
-            failed.append(error)
+            self._failed.append(error)
 
-    thread = threading.Thread(target=run, name=name, daemon=True)
-    thread.start()
+    def has_failed(self) -> bool:
+        """Whether it ended by an exception."""
+        return bool(self._failed)
 
-    def wait() -> None:
-        thread.join()
-        if failed:
-            raise failed[0]
-
-    return wait
+    def __call__(self) -> None:
+        self._thread.join()
+        if self._failed:
+            raise self._failed[0]
 
 
 class _StopSignals:
