@@ -29,12 +29,13 @@ from drivers.logs import Log, LogError, LogScan, PoseKind, read_log
 from mapping.frames import Pose2, wrap_angle
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
-from mapping.lines.lines import Lines
+from mapping.lines.line_map import LineMap
 from service.errors import WrongUsage
 from service.export import image_of, save_grid, save_pgm_yaml
 from service.files import write_whole
 from service.line_files import write_lines
 from service.log_lines import line_map_of
+from service.map_export import LINES, lines_layer
 from service.map_import import write_grid_map
 
 F64 = NDArray[np.float64]
@@ -72,7 +73,7 @@ class Built:
     scans: Sequence[LogScan]
     robot_poses: F64
     grid: OccupancyGrid
-    lines: Lines
+    line_map: LineMap
     inserted: int
     hold_out: HoldOut | None
     seconds: dict[str, float]
@@ -117,11 +118,11 @@ def build(
     held = set(range(0, len(scans), hold_out)) if hold_out else set()
     insert_scans(grid, log, scans, robot_poses, left_out=held, progress=progress)
     mapped = time.monotonic()
-    lines = lines_of(log, scans, robot_poses, left_out=held)
+    line_map = lines_of(log, scans, robot_poses, left_out=held)
     lined = time.monotonic()
     judged = judge(grid.patch(), log, [scans[i] for i in sorted(held)], robot_poses[sorted(held)]) if held else None
     return Built(
-        log, scans, robot_poses, grid, lines, len(scans) - len(held), judged,
+        log, scans, robot_poses, grid, line_map, len(scans) - len(held), judged,
         {"read": read - started, "localise": localised - read, "map": mapped - localised, "lines": lined - mapped},
         slam,
     )  # fmt: skip
@@ -156,8 +157,8 @@ def insert_scans(
             progress(index, len(scans))
 
 
-def lines_of(log: Log, scans: Sequence[LogScan], robot_poses: F64, *, left_out: set[int]) -> Lines:
-    """Walls of scans whose robot stood APART_M or APART_RAD from the one before, seen by two of them at least."""
+def lines_of(log: Log, scans: Sequence[LogScan], robot_poses: F64, *, left_out: set[int]) -> LineMap:
+    """Walls of scans whose robot stood APART_M or APART_RAD from the one before."""
     robot_from_laser = Pose2(*log.robot_from_laser)
     chosen: list[int] = []
     for index, pose in enumerate(robot_poses):
@@ -168,7 +169,7 @@ def lines_of(log: Log, scans: Sequence[LogScan], robot_poses: F64, *, left_out: 
             chosen.append(index)
     poses = [Pose2(*robot_poses[index]) @ robot_from_laser for index in chosen]
     line_map, _ = line_map_of([scans[index] for index in chosen], poses, range_max_m=log.range_max_m)
-    return line_map.lines(min_seen=2)
+    return line_map
 
 
 def judge(patch: GridPatch, log: Log, scans: Sequence[LogScan], robot_poses: F64) -> HoldOut:
@@ -232,8 +233,15 @@ def write(built: Built, out: Path, *, source: PoseSource) -> dict[str, object]:
     write_whole(out / "trajectory.tum", trajectory_text(built).encode())
     receipts = save_pgm_yaml(image_of(patch), out / "map.yaml")
     receipts += save_grid(image_of(patch), out / "map.png")
-    receipts.append(write_lines(built.lines, out / "lines.geojson"))
-    receipts.append(write_grid_map(built.grid, out / "map.umfeld", source=built.log.provenance.path))
+    receipts.append(write_lines(built.line_map.lines(min_seen=2), out / "lines.geojson"))
+    receipts.append(
+        write_grid_map(
+            built.grid,
+            out / "map.umfeld",
+            source=built.log.provenance.path,
+            layers={LINES: lines_layer(built.line_map)},
+        )
+    )
     built.seconds["write"] = time.monotonic() - started
     report = report_of(built, patch, source)
     report["files"] = {receipt.path.name: receipt.document() for receipt in receipts}
@@ -268,7 +276,7 @@ def report_of(built: Built, patch: GridPatch, source: PoseSource) -> dict[str, o
         "cells": {"rows": patch.cells.shape[0], "columns": patch.cells.shape[1]},
         "free_m2": float(np.sum((patch.cells >= 0) & (patch.cells < OCCUPIED_FROM_PERCENT)) * area),
         "occupied_m2": float(np.sum(patch.cells >= OCCUPIED_FROM_PERCENT) * area),
-        "lines": len(built.lines),
+        "lines": len(built.line_map.lines(min_seen=2)),
         "refused_tiles": built.grid.refused_tiles,
         "seconds": {name: round(value, 3) for name, value in built.seconds.items()},
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +13,7 @@ from mapping.grids.patch import GridPatch
 from mapping.grids.tiles import TILE
 from service.export import FREE_THRESHOLD, OCCUPIED_THRESHOLD, MapFileTrouble
 from service.files import Receipt
-from service.store import write_occupancy_map
+from service.store import Tile, write_occupancy_map
 
 _OBSERVATIONS = 4
 """Each cell counts as seen this often: sure enough to be occupied or free, and soon overruled by what a robot sees."""
@@ -36,11 +37,21 @@ def write_imported_map(patch: GridPatch, path: Path, *, source: str, model: Lite
     return write_grid_map(grid, path, source=source)
 
 
-def write_grid_map(grid: OccupancyGrid, path: Path, *, source: str) -> Receipt:
-    """A grid as a map file: what exports read, and the tiles from which a daemon restores it; replaces path whole."""
+def write_grid_map(
+    grid: OccupancyGrid, path: Path, *, source: str, layers: Mapping[str, Iterable[Tile]] | None = None
+) -> Receipt:
+    """A grid as a map file: what exports read, and the tiles from which a daemon restores it; replaces path whole.
+
+    layers: of other maps, to go into the same file.
+    """
     properties = {"resolution_m": grid.resolution_m, "model": grid.model, "tile_cells": TILE}
     return write_occupancy_map(
-        grid.patch(), path, source=source, tile_cells=TILE, layers={"grid": grid.tiles()}, meta={"grid": properties}
+        grid.patch(),
+        path,
+        source=source,
+        tile_cells=TILE,
+        layers={"grid": grid.tiles(), **(layers or {})},
+        meta={"grid": properties},
     )
 
 

@@ -13,6 +13,8 @@ import typer
 from service.errors import Trouble, WrongUsage
 
 if TYPE_CHECKING:
+    from mapping.geo import Anchor
+    from mapping.lines.lines import Lines
     from service.export import MapImage
     from service.zenoh_session import Client
 
@@ -174,8 +176,17 @@ def _info_of_file(file: Path) -> dict[str, Any]:
 
 @app.command()
 def export(
-    out: Annotated[Path, typer.Argument(help="Where to; the ending says what: .yaml (with .pgm), .png, .npy, .json.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            help="Where to, by the ending. The grid: .yaml (with .pgm), .png, .npy, .json, .tif (GeoTIFF), .ply. "
+            "Its walls: .geojson, .svg, .dxf."
+        ),
+    ],
     *,
+    anchor: Annotated[
+        str | None, typer.Option(help="LAT,LON[,YAW] of the map's origin in degrees, for .geojson and .tif.")
+    ] = None,
     inflate_m: Annotated[
         float, typer.Option("--inflate", min=0.0, help="Also occupied: all that comes so near, metres, to an obstacle.")
     ] = 0.0,
@@ -185,20 +196,24 @@ def export(
     robot: Robot = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write the grid as a file other programs read. PGM and YAML are the ROS map server's.
+    """Write the map as a file other programs read: the grid (PGM and YAML are the ROS map server's) or its walls.
+
+    Walls are the lines that the laser saw, or the borders of occupied cells where nobody kept lines.
 
     Example: umfeld map export kitchen.yaml --store kitchen.umfeld --inflate 0.3
     """
-    from service.export import save_grid
+    from service.map_export import save_map
 
+    place = None if anchor is None else _anchor(anchor)
     if store is not None:
-        image = _image(store)
+        image, walls = _image(store), _lines_of_file(store)
     else:
         with _client(connect, config) as client:
-            image = _live_image(client, _base(client, robot))
+            base = _base(client, robot)
+            image, walls = _live_image(client, base), _live_lines(client, base)
     if inflate_m > 0.0:
-        image = _inflated(image, inflate_m)
-    receipts = [receipt.document() for receipt in save_grid(image, out)]
+        image, walls = _inflated(image, inflate_m), None
+    receipts = [receipt.document() for receipt in save_map(image, walls, out, anchor=place)]
     if as_json:
         typer.echo(json.dumps({"files": receipts}, indent=2))
         return
@@ -305,6 +320,36 @@ def _image(path: Path) -> MapImage:
         return load_pgm_yaml(path)
     with _open(path) as opened:
         return image_of(occupancy_patch(opened))
+
+
+def _anchor(text: str) -> Anchor:
+    """LAT,LON[,YAW] in degrees; YAW is the map's x axis, counter-clockwise from east."""
+    import math
+
+    from mapping.geo import Anchor
+
+    try:
+        latitude, longitude, yaw = (*(float(part) for part in text.split(",")), 0.0)[:3]
+        return Anchor(latitude, longitude, yaw_rad=math.radians(yaw))
+    except ValueError as error:
+        raise WrongUsage(f"--anchor {text}: LAT,LON or LAT,LON,YAW in degrees, such as 49.42,7.75") from error
+
+
+def _lines_of_file(path: Path) -> Lines | None:
+    from service.map_export import lines_of_store
+
+    if not _is_store(path):
+        return None
+    with _open(path) as opened:
+        return lines_of_store(opened)
+
+
+def _live_lines(client: Client, base: str) -> Lines | None:
+    """The line map of a running daemon, if it keeps one."""
+    from service.map_export import lines_of_document
+
+    answers = client.get(f"{base}/map/lines", timeout_s=10.0)
+    return lines_of_document(json.loads(answers[0].payload)) if answers else None
 
 
 def _inflated(image: MapImage, radius_m: float) -> MapImage:
