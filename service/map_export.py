@@ -70,9 +70,7 @@ def lines_of_document(document: Mapping[str, Any]) -> Lines | None:
     start, end = (np.array([each[name] for each in entries], dtype=np.float64) for name in ("start", "end"))
     points = np.array([each["points"] for each in entries], dtype=np.float64)
     seen = np.array([each["scans"] for each in entries], dtype=np.float64)
-    variance = np.array(
-        [each["covariance"][2] for each in entries], dtype=np.float64
-    )  # rms^2 / points
+    variance = np.array([each["covariance"][2] for each in entries], dtype=np.float64)  # rms^2 / points
     rows = rows_of_ends(start, end, points, seen, np.maximum(np.sqrt(np.maximum(variance, 0.0) * points), 1e-4))
     return Lines(rows, np.full((len(rows), 2), -1, dtype=np.int64))
 
