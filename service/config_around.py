@@ -76,6 +76,15 @@ class Ros(Section):
     domain_id: int = Field(default=0, ge=0, le=232, description="ROS_DOMAIN_ID.")
 
 
+class Anchor(Section):
+    """Where a map's origin lies on the earth (WGS 84), and how the map is turned."""
+
+    latitude_deg: float = Field(ge=-90, le=90, description="Latitude of the map's origin.")
+    longitude_deg: float = Field(ge=-180, le=180, description="Longitude of the map's origin.")
+    height_m: float = Field(default=0.0, description="Height above the ellipsoid.")
+    yaw_deg: float = Field(default=0.0, ge=-360, le=360, description="The map's x axis, counter-clockwise from east.")
+
+
 class Store(Section):
     """The map on disk."""
 
@@ -85,6 +94,9 @@ class Store(Section):
     )
     snapshot_period_s: float = Field(
         default=5.0, ge=0.5, le=3600, description="At most this much is lost when power fails."
+    )
+    anchor: Anchor | None = Field(
+        default=None, description="The map on the earth: kept in its file, for exports; default: the file's own."
     )
 
 

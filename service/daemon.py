@@ -187,8 +187,9 @@ class Daemon:
         self._live_map = None
         if maps.building is not None:
             self._live_map = LiveMap(
-                maps.building, store, ask=self._worker.ask, fusion=self._fusion, makers=self._makers
-            )
+                maps.building, store, ask=self._worker.ask, fusion=self._fusion, makers=self._makers,
+                anchor=None if config.store.anchor is None else config.store.anchor.model_dump(),
+            )  # fmt: skip
             self._publisher.calls.register_map_service(self._live_map)
             self._parts.callback(self._finish_map, self._live_map)
         sink = self._recorder.sink(self._worker.sink)

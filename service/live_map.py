@@ -29,6 +29,9 @@ GRID = "grid"
 SLAM = "slam"
 """The layer of SLAM's own tiles (service/slam_store.py)."""
 
+ANCHOR = "anchor"
+"""Meta: latitude_deg, longitude_deg, height_m, yaw_deg of the map's origin and x axis."""
+
 T = TypeVar("T")
 
 
@@ -65,14 +68,19 @@ class LiveMap:
         ask: Ask,
         fusion: Drawing,
         makers: MapMakers | None = None,
+        anchor: Mapping[str, float] | None = None,
     ) -> None:
-        """fusion: draws the grid, and knows where the robot is; touched where `ask` runs.  makers: kept too."""
+        """fusion: draws the grid, and knows where the robot is; touched where `ask` runs.  makers: kept too.
+
+        anchor: the map on the earth, as map files keep it; None: what the store says.
+        """
         self._layer = layer
         self._store = store
         self._queue = None if store is None else SnapshotQueue(store)
         self._ask = ask
         self._fusion = fusion
         self._makers = makers
+        self._anchor = store.get_meta(ANCHOR) if anchor is None and store is not None else anchor
 
     # --- while running
 
@@ -113,6 +121,8 @@ class LiveMap:
             GRID: {"resolution_m": grid.resolution_m, "model": grid.model, "tile_cells": TILE},
             OCCUPANCY: {"resolution_m": grid.resolution_m, "tile_cells": TILE},
         }
+        if self._anchor is not None:
+            meta[ANCHOR] = dict(self._anchor)
         if pose is not None:
             meta["pose"] = {"x_m": pose.x_m, "y_m": pose.y_m, "yaw_rad": pose.yaw_rad}
         return meta
@@ -137,12 +147,14 @@ class LiveMap:
             ready_made = saved.load_tiles(OCCUPANCY)
             made = {} if self._makers is None else {name: saved.load_tiles(name) for name in self._makers.layers}
             slam = saved.load_tiles(SLAM)
+            anchor = saved.get_meta(ANCHOR)
             check_fits(self._layer.grid, saved)
         if not tiles:
             raise CallRefused(f"{path}: holds no grid to go on with; `umfeld map import` makes one from a picture")
         self._check_tiles(path, tiles)
         self.snapshot()  # so that nothing older waits behind what is written next
         self._ask(lambda: self._replace(tiles, slam))
+        self._anchor = anchor
         meta = self._meta(None)
         if self._makers is not None:
             self._makers.restore(lambda name: made[name])

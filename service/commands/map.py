@@ -185,7 +185,11 @@ def export(
     ],
     *,
     anchor: Annotated[
-        str | None, typer.Option(help="LAT,LON[,YAW] of the map's origin in degrees, for .geojson and .tif.")
+        str | None,
+        typer.Option(
+            help="LAT,LON[,YAW] of the map's origin in degrees, for .geojson and .tif; none: metres of the map frame. "
+            "Default: what the map itself says."
+        ),
     ] = None,
     inflate_m: Annotated[
         float, typer.Option("--inflate", min=0.0, help="Also occupied: all that comes so near, metres, to an obstacle.")
@@ -204,13 +208,16 @@ def export(
     """
     from service.map_export import save_map
 
-    place = None if anchor is None else _anchor(anchor)
+    place = None if anchor in (None, "none") else _anchor(str(anchor))
     if store is not None:
-        image, walls = _image(store), _lines_of_file(store)
+        image, walls, own = _image(store), _lines_of_file(store), _anchor_of_file(store)
     else:
         with _client(connect, config) as client:
             base = _base(client, robot)
             image, walls = _live_image(client, base), _live_lines(client, base)
+            own = client.call(base, "map_info").get("store", {}).get("meta", {}).get("anchor")
+    if anchor is None and own is not None:
+        place = _stored_anchor(own)
     if inflate_m > 0.0:
         image, walls = _inflated(image, inflate_m), None
     receipts = [receipt.document() for receipt in save_map(image, walls, out, anchor=place)]
@@ -228,6 +235,9 @@ def import_map(
     *,
     resolution: Annotated[float | None, typer.Option(help="Cells of this many metres; default: the picture's.")] = None,
     model: Annotated[Model, typer.Option(help="As in [grid] of the daemon that shall load it.")] = Model.COUNTERS,
+    anchor: Annotated[
+        str | None, typer.Option(help="LAT,LON[,YAW] of the map's origin on the earth, in degrees; kept in the file.")
+    ] = None,
     force: Annotated[bool, typer.Option(help="Replace the file if it is there.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -247,7 +257,8 @@ def import_map(
     if resolution is not None and not 0.001 <= resolution <= 10.0:
         raise WrongUsage(f"--resolution {resolution}: metres a cell, from 0.001 to 10")
     patch = patch_of(load_pgm_yaml(source), resolution)
-    receipt = write_imported_map(patch, out, source=source.name, model=model.value)
+    place = None if anchor is None else _anchor(anchor)
+    receipt = write_imported_map(patch, out, source=source.name, model=model.value, anchor=place)
     _report(receipt.document(), as_json)
 
 
@@ -333,6 +344,23 @@ def _anchor(text: str) -> Anchor:
         return Anchor(latitude, longitude, yaw_rad=math.radians(yaw))
     except ValueError as error:
         raise WrongUsage(f"--anchor {text}: LAT,LON or LAT,LON,YAW in degrees, such as 49.42,7.75") from error
+
+
+def _stored_anchor(fields: Mapping[str, float]) -> Anchor:
+    import math
+
+    from mapping.geo import Anchor
+
+    yaw_rad = math.radians(fields["yaw_deg"])
+    return Anchor(fields["latitude_deg"], fields["longitude_deg"], fields["height_m"], yaw_rad)
+
+
+def _anchor_of_file(path: Path) -> Mapping[str, float] | None:
+    if not _is_store(path):
+        return None
+    with _open(path) as opened:
+        anchor: Mapping[str, float] | None = opened.get_meta("anchor")
+        return anchor
 
 
 def _lines_of_file(path: Path) -> Lines | None:

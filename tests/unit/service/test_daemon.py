@@ -274,6 +274,23 @@ def test_saving_and_loading_by_name(store: MapStore) -> None:
         keeper.load("live")
 
 
+def test_the_place_on_the_earth_goes_with_the_map(store: MapStore) -> None:
+    layer, place = building(), {"latitude_deg": 49.42, "longitude_deg": 7.75, "height_m": 0.0, "yaw_deg": 30.0}
+    keeper = LiveMap(layer, store, ask=lambda work: work(), fusion=Standing(None), anchor=place)
+    draw(layer, 0.0)
+    keeper.save("kitchen")
+    assert live(layer, store).info()["store"]["meta"]["anchor"] == place
+    draw(layer, 10.0)
+    live(layer, store).snapshot()  # a later start that does not say it
+    assert store.get_meta("anchor") == place
+    with MapStore.open(store.path.parent / "hall.umfeld", wall_ns=lambda: 1) as hall:
+        hall.snapshot({GRID: list(layer.grid.tiles())}, {GRID: store.get_meta(GRID)})
+    keeper.load("hall")
+    assert store.get_meta("anchor") is None, "another map, which does not say where it lies"
+    keeper.load("kitchen")
+    assert store.get_meta("anchor") == place
+
+
 def test_a_torn_map_is_not_loaded_and_the_live_one_stays(store: MapStore) -> None:
     layer = building()
     keeper = live(layer, store)

@@ -157,3 +157,22 @@ def test_an_anchor_that_is_none(text: str, tmp_path: Path) -> None:
     ran = CliRunner().invoke(app, ["export", str(tmp_path / "m.tif"), "--store", "x.umfeld", "--anchor", text])
     assert ran.exit_code != 0
     assert "--anchor" in str(ran.exception)
+
+
+def test_a_map_carries_its_anchor_into_exports(tmp_path: Path) -> None:
+    pytest.importorskip("pyproj")
+    save_map(image(Pose2()), None, tmp_path / "floor.yaml")
+    floor, source = str(tmp_path / "floor.umfeld"), str(tmp_path / "floor.yaml")
+    made = CliRunner().invoke(app, ["import", source, floor, "--anchor", "49.42,7.75,30"])
+    assert made.exit_code == 0, made.output
+
+    def corner(*options: str) -> list[float]:
+        out = tmp_path / "out.geojson"
+        ran = CliRunner().invoke(app, ["export", str(out), "--store", floor, *options])
+        assert ran.exit_code == 0, ran.output
+        found: list[float] = json.loads(out.read_bytes())["features"][0]["geometry"]["coordinates"][0]
+        return found
+
+    assert corner() == pytest.approx([7.75, 49.42], abs=1e-5)
+    assert corner("--anchor", "-33.9,151.2") == pytest.approx([151.2, -33.9], abs=1e-5)
+    assert max(map(abs, corner("--anchor", "none"))) < 1.0
