@@ -155,7 +155,7 @@ class LiveMap:
         self.snapshot()  # so that nothing older waits behind what is written next
         self._ask(lambda: self._replace(tiles, slam))
         self._anchor = anchor
-        meta = self._meta(None)
+        meta = {**self._meta(None), ANCHOR: anchor}
         if self._makers is not None:
             self._makers.restore(lambda name: made[name])
         store.snapshot({GRID: tiles, OCCUPANCY: ready_made, SLAM: slam, **made}, meta, replace=True)
