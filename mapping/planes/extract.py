@@ -474,7 +474,10 @@ def depth_step_per_m2(x: F64, y: F64, z: F64) -> float:
     """The step of a depth camera, over the square of the depth; 0 if depths do not come in steps.
 
     They do if one coordinate takes few values and the gaps between these grow with it about as its square.
+    x, y, z: (N,) finite; no points have no steps.
     """
+    if len(x) == 0:
+        return 0.0
     for column in (z, x, y):
         sample = np.abs(column[:: max(1, len(column) // _STEP_SAMPLES)])
         part = np.sort(sample[::_STEP_PART])
