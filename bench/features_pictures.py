@@ -24,11 +24,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.relocalise_features import SHARE, outcome, posed_scans, remembered, spaced
 from mapping.features.anchors import AnchorFinder, AnchorKind
-from mapping.features.graph import anchor_graph
+from mapping.features.graph import anchor_graph, compare
 from mapping.features.histograms import box_feature, square_scene, virtual_edges
 from mapping.features.moments import arc_weights, inertia, smoothed_distances
 from mapping.features.range_image import Mark, segment_ranges, surface_angles
-from mapping.features.scenes import sight_of
+from mapping.features.scenes import SCENE_FEATURES, sight_of
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -146,6 +146,67 @@ def found_place(folder: Path) -> None:
     save(figure, folder / "features_place.png")
 
 
+def compared(folder: Path) -> None:
+    """S22: two scans of one place and what their graphs have in common; S23, S24: how feature vectors differ with the
+    way between the places they are of, and where the nearest vectors of one question were taken."""
+    kept = [(scan, pose, sight_of(scan)) for scan, pose in spaced(posed_scans("fr079"))]
+    pair, most = (0, 0), 0
+    for i in range(0, len(kept), 5):
+        for j in range(i + 20, len(kept), 3):  # not from the same pass
+            if 0.3 < np.hypot(kept[i][1].x_m - kept[j][1].x_m, kept[i][1].y_m - kept[j][1].y_m) < 1.5:
+                match = compare(kept[i][2].graph, kept[j][2].graph)
+                if match is not None and len(match) > most:
+                    pair, most = (i, j), len(match)
+    figure, axes = plt.subplots(1, 3, figsize=(18, 6), layout="constrained")
+    (scan_a, _, a), (scan_b, _, b) = kept[pair[0]], kept[pair[1]]
+    match = compare(a.graph, b.graph)
+    assert match is not None
+    panel = axes[0]
+    shift = np.array([-1.2 * float(np.ptp(points_of(scan_a)[0][:, 0])), 0.0])
+    own, its = a.graph.anchors.points + shift, b.graph.anchors.points
+    for corners, edges in ((own, a.graph.edges), (its, b.graph.edges)):
+        for i, j in edges:
+            panel.plot(*corners[[i, j]].T, "-", color="0.9", lw=0.5)
+    panel.plot(*(points_of(scan_a)[0] + shift).T, ".", ms=3, color="C0")
+    panel.plot(*points_of(scan_b)[0].T, ".", ms=3, color="C1")
+    panel.plot(*own.T, "o", mfc="none", color="C0")
+    panel.plot(*its.T, "o", mfc="none", color="C1")
+    for i, j in match.pairs:
+        panel.plot(*np.stack((own[i], its[j])).T, "-", color="C3", lw=1)
+    panel.set_title(
+        f"S22: {len(match)} partners of {len(own)} and {len(its)} anchors, {100 * match.rms_m:.0f} cm apart"
+    )
+    panel.set_aspect("equal")
+    panel = axes[1]
+    at = np.array([(pose.x_m, pose.y_m) for _, pose, _ in kept])
+    vectors = np.array([sight.vector for _, _, sight in kept])
+    first, second = np.triu_indices(len(kept), 1)
+    way = np.hypot(*(at[first] - at[second]).T)
+    apart = SCENE_FEATURES.distance(vectors[first], vectors[second])
+    edges = np.arange(0.0, 12.5, 0.5)
+    for share, style in ((0.25, "C0--"), (0.5, "C0-"), (0.75, "C0--")):
+        inside = [apart[(way >= low) & (way < low + 0.5)] for low in edges]
+        panel.plot(edges + 0.25, [float(np.quantile(v, share)) for v in inside], style)
+    panel.set_title(
+        "S23, S24: distance of feature vectors by the way between\nthe places [m]; median and quartiles, all pairs"
+    )
+    panel.set_ylim(0.0)
+    panel = axes[2]
+    asked = pair[1]
+    distance = SCENE_FEATURES.distance(vectors, vectors[asked])
+    others = np.flatnonzero(np.arange(len(kept)) != asked)
+    shown = panel.scatter(*at[others].T, c=distance[others], s=8, cmap="viridis")
+    nearest = others[np.argsort(distance[others], kind="stable")[:8]]
+    panel.plot(*at[nearest].T, "o", mfc="none", ms=10, color="C3", label="the eight nearest vectors")
+    panel.plot(*at[asked], "k*", ms=12, label="the question")
+    panel.legend()
+    figure.colorbar(shown, ax=panel, shrink=0.7)
+    panel.set_title("S24, S25: distance of each scene's vector from one question's")
+    panel.set_aspect("equal")
+    figure.savefig(folder / "features_compare.png", dpi=70)
+    plt.close(figure)
+
+
 def save(figure: Any, path: Path) -> None:
     figure.tight_layout()
     figure.savefig(path, dpi=70)
@@ -172,6 +233,7 @@ def main() -> None:
     folder = parser.parse_args().out
     one_scan(folder, telling(scan for scan, _ in spaced(posed_scans("fr079"))))
     found_place(folder)
+    compared(folder)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def base(free: NDArray[np.bool_], axes: Any) -> None:
 def steps(free: NDArray[np.bool_], folder: Path) -> None:
     """Diagram; rooms and doors."""
     grid, found = VoronoiGrid(free), find_rooms(free, CELL_M)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(12, 6))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(12, 6.4), layout="constrained")
     base(free, left)
     rows, cols = np.nonzero(grid.axis)
     left.scatter((cols + 0.5) * CELL_M, (rows + 0.5) * CELL_M, s=0.15, color="tab:blue", linewidths=0)
@@ -50,7 +50,6 @@ def steps(free: NDArray[np.bool_], folder: Path) -> None:
         ends = (np.array(door.ends)[:, ::-1] + 0.5) * CELL_M
         right.plot(ends[:, 0], ends[:, 1], color="red", linewidth=2)
     right.set_title("rooms, and the critical lines that stayed")
-    figure.tight_layout()
     figure.savefig(folder / "rooms_steps.png", dpi=80)
     plt.close(figure)
 

@@ -420,18 +420,64 @@ def half_widths(reach: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
+def beside(row: Any, a: Any, obstacle: Any) -> Any:
+    """Which cells around (row, a) are obstacles: bits 0 to 2 to the left, in the row before, its own and the one after;
+    bits 3 to 5 to the right."""
+    rows, cols = obstacle.shape
+    bits = 0
+    for way in range(2):
+        c = a + 2 * way - 1
+        if 0 <= c < cols:
+            for step in range(3):
+                r = row + step - 1
+                if 0 <= r < rows and obstacle[r, c]:
+                    bits |= 1 << (3 * way + step)
+    return bits
+
+
+@njit(cache=True, nogil=True)
+def span_ruled(down: Any, bits: Any, wide: Any) -> Any:
+    """(first, last) column, from its own, that an obstacle can rule `down` rows below it: within `wide` of it, and not
+    beyond the middle between it and those `beside` it."""
+    first, last = -wide, wide
+    if bits & 1:
+        first = max(first, -1 - down)
+    if bits & 2:
+        first = max(first, 0)
+    if bits & 4:
+        first = max(first, -1 + down)
+    if bits & 8:
+        last = min(last, 1 + down)
+    if bits & 16:
+        last = min(last, 0)
+    if bits & 32:
+        last = min(last, 1 - down)
+    return first, last
+
+
+@njit(cache=True, nogil=True)
 def add_within(new: Any, half: Any, obstacle: Any, columns: Any, squared: Any, site: Any, spans: Any) -> None:
-    """new: (N, 2) int32 cells, free before.  half: `half_widths` of the reach."""
+    """new: (N, 2) int32 cells, free before.  half: `half_widths` of the reach.
+
+    All of them are there before the first takes its cells, so none looks at what another of them rules.
+    """
     total_rows, cols = site.shape
     reach = half.size - 1
     for k in range(new.shape[0]):
         row, a = np.int64(new[k, 0]), np.int64(new[k, 1])
+        obstacle[row, a] = 1
+        columns[a, row >> 6] |= np.uint64(1) << np.uint64(row & 63)
+    for k in range(new.shape[0]):
+        row, a = np.int64(new[k, 0]), np.int64(new[k, 1])
         name, order = np.int32(row << 16 | a), np.int32(a << 16 | row)
         above, below = rows_ruled(columns, row, a, total_rows)
+        bits = beside(row, a, obstacle)
         for r in range(max(above, row - reach), min(below, row + reach) + 1):
-            wide = np.int64(half[abs(r - row)])
-            first: Any = max(a - wide, 0)
-            stop: Any = min(a + wide + 1, cols)
+            low, high = span_ruled(r - row, bits, np.int64(half[abs(r - row)]))
+            first: Any = max(a + low, 0)
+            stop: Any = min(a + high + 1, cols)
+            if first >= stop:
+                continue
             h = np.int32((r - row) * (r - row))
             distances, names = squared[r, first:stop], site[r, first:stop]
             from_a, took = np.int32(first - a), np.int32(0)
@@ -446,8 +492,6 @@ def add_within(new: Any, half: Any, obstacle: Any, columns: Any, squared: Any, s
                 took += np.int32(nearer)
             if took > 0:
                 note_span(spans, r, first, stop)
-        obstacle[row, a] = 1
-        columns[a, row >> 6] |= np.uint64(1) << np.uint64(row & 63)
 
 
 @njit(cache=True, nogil=True)
@@ -462,10 +506,13 @@ def remove_within(
     for k in range(lost.shape[0]):
         row, a = np.int64(lost[k, 0]), np.int64(lost[k, 1])
         above, below = rows_ruled(columns, row, a, total_rows)
+        bits = beside(row, a, obstacle)
         for r in range(max(above, row - reach), min(below, row + reach) + 1):
-            wide = np.int64(half[abs(r - row)])
-            left: Any = max(a - wide, 0)
-            right: Any = min(a + wide, cols - 1)
+            low, high = span_ruled(r - row, bits, np.int64(half[abs(r - row)]))
+            left: Any = max(a + low, 0)
+            right: Any = min(a + high, cols - 1)
+            if left > right:
+                continue
             for b in range(left >> _BLOCK_BITS, (right >> _BLOCK_BITS) + 1):
                 near[r, b] = 1
             top, bottom = min(top, r), max(bottom, r)

@@ -70,7 +70,7 @@ def squeeze(v: int) -> Any:
 def morton_keys(points: Any, corner: Any, size_m: float, first: int, last: int, key: Any) -> None:
     """Keys (N,) of points (N, 3), from first to last - 1, on a lattice of cells of size_m with its first corner."""
     top = (1 << BITS) - 1
-    for k in range(first, last):
+    for k in range(np.uint64(first), np.uint64(last)):
         i = min(max(math.floor((points[k, 0] - corner[0]) / size_m), 0), top)
         j = min(max(math.floor((points[k, 1] - corner[1]) / size_m), 0), top)
         h = min(max(math.floor((points[k, 2] - corner[2]) / size_m), 0), top)
@@ -151,8 +151,8 @@ def usable(points: Any, farthest_m: float, low: Any, high: Any) -> Any:
 @njit(cache=True, nogil=True)
 def gather(points: Any, order: Any, first: int, last: int, x: Any, y: Any, z: Any) -> None:
     """Columns in sorted order, from first to last - 1."""
-    for k in range(first, last):
-        i = order[k]
+    for k in range(np.uint64(first), np.uint64(last)):
+        i = np.uint64(order[k])
         x[k], y[k], z[k] = points[i, 0], points[i, 1], points[i, 2]
 
 
@@ -229,7 +229,7 @@ def scatter_of(
     x0, y0, z0 = x[begin], y[begin], z[begin]
     n = 0
     w = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
-    for k in range(begin, end):
+    for k in range(np.uint64(begin), np.uint64(end)):
         if abs(nx * x[k] + ny * y[k] + nz * z[k] - d) <= limit:
             u, v, t, m = x[k] - x0, y[k] - y0, z[k] - z0, weight[k]
             n += 1
@@ -368,9 +368,10 @@ def ransac(x: Any, y: Any, z: Any, begin: int, end: int, limit: float, iteration
 def inliers_of(
     x: Any, y: Any, z: Any, begin: int, end: int, nx: float, ny: float, nz: float, d: float, limit: float
 ) -> Any:
-    """How many points are within limit of a plane. A loop without branches, which the compiler makes wide."""
+    """How many points are within limit of a plane: a loop without branches, which the compiler makes wide if it knows
+    that no index counts from the end."""
     count = 0
-    for k in range(begin, end):
+    for k in range(np.uint64(begin), np.uint64(end)):
         count += abs(nx * x[k] + ny * y[k] + nz * z[k] - d) <= limit
     return count
 
@@ -632,11 +633,11 @@ def put(mark: Any, index: Any, name: int, value: int) -> None:
 @njit(cache=True, nogil=True)
 def get(mark: Any, index: Any, name: int) -> Any:
     """The value of a name, -1 if it is not there."""
-    at = slot_of(name, mark.size)
+    at, last = np.uint64(slot_of(name, mark.size)), np.uint64(mark.size - 1)
     while mark[at] >= 0:
         if mark[at] == name:
             return index[at]
-        at = (at + 1) & (mark.size - 1)
+        at = (at + np.uint64(1)) & last
     return -1
 
 
@@ -936,7 +937,7 @@ def label_nearest(
             for j in range(i):
                 pair[i, j] = get(mark, index, pair_name(near[i], near[j]))
                 pair[j, i] = pair[i, j]
-        for k in range(begin[c], end[c]):
+        for k in range(np.uint64(begin[c]), np.uint64(end[c])):
             at, best = -1, 0.0
             sigma = noise(x[k] * x[k] + y[k] * y[k] + z[k] * z[k], rules)
             for i in range(count):
@@ -1018,7 +1019,7 @@ def labels_as_given(found: Any, order: Any, usable: Any, rank: Any, label: Any) 
     for k in range(found.size):
         if found[k] >= 0:
             found[k] = rank[found[k]]
-        label[usable[order[k]]] = found[k]
+        label[np.uint64(usable[np.uint64(order[k])])] = found[k]
 
 
 @njit(cache=True, nogil=True)
@@ -1063,10 +1064,11 @@ def hulls(x: Any, y: Any, z: Any, first: Any, member: Any, centre: Any, along: A
     begins = np.zeros(regions + 1, np.int64)
     made = 0
     for r in range(regions):
-        n = first[r + 1] - first[r]
+        mine = member[first[r] : first[r + 1]]
+        n = mine.size
         u, v = np.empty(n), np.empty(n)
         for k in range(n):
-            i = member[first[r] + k]
+            i = np.uint64(mine[k])
             a, b, c = x[i] - centre[r, 0], y[i] - centre[r, 1], z[i] - centre[r, 2]
             u[k] = a * along[r, 0] + b * along[r, 1] + c * along[r, 2]
             v[k] = a * across[r, 0] + b * across[r, 1] + c * across[r, 2]

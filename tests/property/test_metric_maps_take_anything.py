@@ -134,7 +134,7 @@ def test_free_space_has_an_area_and_frontiers(drive: list[tuple[list[float], Pos
                 pose, scan.bearing_rad, scan.range_m, range_max_m=30.0
             )
         )
-        area = space.area_m2()
+        area = space.area_m2
         assert area >= before - 1e-6 * (1.0 + before)
         before = area
     for edge in space.frontiers():
