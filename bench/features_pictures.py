@@ -183,10 +183,10 @@ def compared(folder: Path) -> None:
     first, second = np.triu_indices(len(kept), 1)
     way = np.hypot(*(at[first] - at[second]).T)
     apart = SCENE_FEATURES.distance(vectors[first], vectors[second])
-    edges = np.arange(0.0, 12.5, 0.5)
+    lows = np.arange(0.0, 12.5, 0.5)
     for share, style in ((0.25, "C0--"), (0.5, "C0-"), (0.75, "C0--")):
-        inside = [apart[(way >= low) & (way < low + 0.5)] for low in edges]
-        panel.plot(edges + 0.25, [float(np.quantile(v, share)) for v in inside], style)
+        inside = [apart[(way >= low) & (way < low + 0.5)] for low in lows]
+        panel.plot(lows + 0.25, [float(np.quantile(v, share)) for v in inside], style)
     panel.set_title(
         "S23, S24: distance of feature vectors by the way between\nthe places [m]; median and quartiles, all pairs"
     )
