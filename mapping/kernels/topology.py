@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 WORD = 64  # nodes in a word of marks
-BLOCK = 1024  # nodes whose sums stay in the first-level cache while all directions are added
+BLOCK = 64  # nodes that lie together: one box around them, one register of codes for each direction
 LARGEST_FIRST, LARGEST = 255.0, 127.0  # code: eight bits in the first, widest group, else seven; see lead_sums
 GROUP = 8  # directions that are added at a time
 MOST_SHIFT = 8  # of a group's squares: sums of 16 groups stay below FAR
@@ -172,22 +172,29 @@ def code_all(
     axes: Any,
     origin: Any,
     steps: Any,
+    name: Any,
     columns: Any,
     rows: Any,
+    low: Any,
+    high: Any,
     errors: Any,
 ) -> None:
-    """Turn and code the nodes first .. last - 1.
+    """Turn and code the nodes in the places first .. last - 1.
 
-    rows: (capacity, m) float32, their coordinates.  columns: (blocks, m, BLOCK) uint8, their codes.  errors:
-    (groups,), raised where these nodes are rounded more than any before.
+    name: (capacity,) int32, which node is in a place.  rows: (capacity, m) float32, their coordinates.  columns:
+    (blocks, m, BLOCK) uint8, their codes.  low, high: (m, blocks) float32, boxes around blocks, made wider where these
+    nodes lie outside.  errors: (groups,), raised where these nodes are rounded more than any before.
     """
     codes = np.empty(rows.shape[1], dtype=np.uint8)
     off = np.empty(errors.shape[0])
     for j in range(first, last):
-        turn(nodes[j], centre, axes, rows[j])
+        turn(nodes[name[j]], centre, axes, rows[j])
         code(rows[j], origin, steps, codes, off)
+        b = j // BLOCK
         for d in range(codes.shape[0]):
-            columns[j // BLOCK, d, j % BLOCK] = codes[d]
+            columns[b, d, j % BLOCK] = codes[d]
+            low[d, b] = min(low[d, b], rows[j, d])
+            high[d, b] = max(high[d, b], rows[j, d])
         for g in range(errors.shape[0]):
             errors[g] = max(errors[g], off[g])
 
@@ -249,6 +256,26 @@ def squared_row(row: Any, query: Any, limit: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
+def box_distances(low: Any, high: Any, row: Any, bound: Any) -> Any:
+    """bound: (blocks,) float32 out, squared distance to the box of each block; the block that is nearest."""
+    for b in range(bound.shape[0]):
+        bound[b] = np.float32(0.0)
+    for d in range(row.shape[0]):
+        here, least, most = row[d], low[d], high[d]
+        for b in range(bound.shape[0]):
+            before, beyond = least[b] - here, here - most[b]  # one of them at most is above 0
+            twice = (before + abs(before)) + (beyond + abs(beyond))  # no maximum: that would not be vectorised
+            bound[b] += twice * twice
+    nearest = 0
+    for b in range(bound.shape[0]):
+        bound[b] *= np.float32(0.25)
+    for b in range(bound.shape[0]):
+        if bound[b] < bound[nearest]:
+            nearest = b
+    return nearest
+
+
+@njit(cache=True, nogil=True)
 def nearest_bounded(
     nodes: Any,
     count: int,
@@ -258,56 +285,67 @@ def nearest_bounded(
     origin: Any,
     steps: Any,
     shifts: Any,
+    name: Any,
     columns: Any,
     rows: Any,
+    low: Any,
+    high: Any,
     errors: Any,
-    sums: Any,
+    bound: Any,
     in_question: Any,
     nearness: Any,
     lead: int,
     best: int,
     best_squared: float,
 ) -> Any:
-    """(number, squared distance, nodes in question, nodes read) of the nearest node.
+    """(number, squared distance, blocks looked at, nodes in question, nodes read) of the nearest node.
 
     centre .. errors: as code_all takes and makes them.  shifts: (groups,), steps[g] = steps.min() * 2^(shifts[g] / 2),
-    so that sums are in units of the smallest step squared.  sums, in_question (int32), nearness (float64):
-    (capacity,), work.  lead: groups that are summed for all nodes; those not ruled out by it are in question and
-    compared by their rows, and read only if rounding to 32 bits leaves a doubt.  best, best_squared: a node already
-    known, or -1 and inf.
+    so that sums are in units of the smallest step squared.  bound: (blocks,) float32, in_question (int32), nearness
+    (float64): (capacity,), work.  lead: groups that are summed for all nodes of the blocks whose box is near enough;
+    those not ruled out by it are in question and compared by their rows, and read only if rounding to 32 bits leaves a
+    doubt.  best, best_squared: a node already known, or -1 and inf.
     """
     blocks = (count + BLOCK - 1) // BLOCK
     row = np.empty(axes.shape[1], dtype=np.float32)
     own = np.empty(axes.shape[1], dtype=np.uint8)
     slack = np.empty(steps.shape[0])
+    sums = np.empty(BLOCK, dtype=np.int32)
     turn(query, centre, axes, row)
     code(row, origin, steps, own, slack)
     unit, off = steps.min(), slack[lead - 1] + errors[lead - 1] + GUARD
-    least = np.empty(blocks, dtype=np.int32)
-    start = 0
-    for b in range(blocks):
-        least[b] = lead_sums(columns[b], own, lead, shifts, sums[b * BLOCK : min((b + 1) * BLOCK, count)])
-        if least[b] < least[start]:
-            start = b
+    start = box_distances(low, high, row, bound[:blocks])
     near = best_squared  # squared distance of the nearest so far, by rows
-    for j in range(start * BLOCK, count):
-        if sums[j] == least[start]:  # the likeliest of all before the others, for a low limit
-            near = min(near, squared_row(rows[j], row, np.inf))
-            break
     limit = sum_limit(near, unit, off)
-    found = 0
-    for b in range(blocks):
-        if least[b] > limit:
-            continue
-        for j in range(b * BLOCK, min((b + 1) * BLOCK, count)):
-            if sums[j] > limit:
+    found, looked_at = 0, 0
+    for turn_number in range(3):  # the nearest block, then those half as far as the best in it, then the others
+        first, last = (start, start + 1) if turn_number == 0 else (0, blocks)
+        within = widened(near) if turn_number != 1 else 0.25 * near
+        for b in range(first, last):
+            if bound[b] > within:
                 continue
-            squared = squared_row(rows[j], row, widened(near))
-            in_question[found], nearness[found] = j, squared
-            found += 1
-            if squared < near:
-                near = squared
-                limit = sum_limit(near, unit, off)
+            bound[b] = np.inf  # once only
+            looked_at += 1
+            size = min(count - b * BLOCK, BLOCK)
+            least = lead_sums(columns[b], own, lead, shifts, sums[:size])
+            if least > limit:
+                continue
+            likeliest = 0
+            while sums[likeliest] != least:
+                likeliest += 1
+            near = min(near, squared_row(rows[b * BLOCK + likeliest], row, np.inf))
+            limit = sum_limit(near, unit, off)
+            for j in range(size):
+                if sums[j] > limit:
+                    continue
+                squared = squared_row(rows[b * BLOCK + j], row, widened(near))
+                in_question[found], nearness[found] = name[b * BLOCK + j], squared
+                found += 1
+                if squared < near:
+                    near = squared
+                    limit = sum_limit(near, unit, off)
+            if turn_number == 2:
+                within = widened(near)
     read = 0
     for place in range(found):
         if nearness[place] <= widened(near):
@@ -316,7 +354,7 @@ def nearest_bounded(
             read += 1
             if squared < best_squared or (squared == best_squared and number < best):
                 best, best_squared = number, squared
-    return best, best_squared, found, read
+    return best, best_squared, looked_at, found, read
 
 
 @njit(cache=True, nogil=True)

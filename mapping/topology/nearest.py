@@ -6,7 +6,8 @@ Two structures are kept beside the nodes, both updated node by node:
   stands, as bits, which nodes have a component within reach D of it. A node nearer than D is marked in all
   dimensions, so if none is, none is that near. With k such that an interval is D wide this is the book's
   (q - 1) .. (q + 2); narrower intervals, the default, leave fewer candidates for the same number of bits read.
-- Bounds: the nodes turned into their principal directions, in seven or eight bits a number, the widest first.
+- Bounds: the nodes turned into their principal directions, in blocks that lie together. A box around each block rules
+  out most of them. The others' nodes are compared in seven or eight bits a number, the widest directions first.
   Turning changes no distance; leaving directions out and clipping make none longer; the error of rounding is known:
   what remains is a bound below the distance. Few nodes are still in question after that; these are compared by their
   turned coordinates, and read in full where rounding those to 32 bits leaves a doubt.
@@ -34,6 +35,9 @@ MOST_DIRECTIONS = 100  # dimensions; for more, rounding is not proven to stay be
 MOST_INTERVAL_BITS = 5
 _WATCHED = 64  # queries between two decisions
 _MANY_IN_QUESTION = 1 / 150  # of the nodes: one group of directions more for all then costs as much
+_GROWN = 1.25
+_TAIL = 1024
+_MOVES = 8
 _MARKS_WORTH = 128  # marks pay while candidates are fewer than one in so many nodes
 _GUARD = 1e-9  # for the rounding of 64-bit numbers
 
@@ -47,7 +51,8 @@ class Effort:
     by_bounds: int = 0
     flat: int = 0
     candidates: int = 0  # of the interval index, summed
-    in_question: int = 0  # nodes that the bounds did not rule out, summed
+    looked_at: int = 0  # nodes of the blocks whose boxes did not rule them out, summed
+    in_question: int = 0  # nodes that no bound ruled out, summed
     read: int = 0  # nodes read in full, summed
 
 
@@ -137,7 +142,10 @@ class NearestNodes:
         self.effort.queries += 1
         best, squared, complete = self._by_marks(query)
         near = self.reach is not None and math.sqrt(squared) <= self.reach
-        if not (complete and (near or limit == self.reach)):
+        answered = complete and (near or limit == self.reach)
+        if complete and self._marks is not None:
+            self._marks.note(answered=answered)
+        if not answered:
             best, squared = self._by_bounds(query, best, squared)
         distance = math.sqrt(squared)
         return (best, distance) if distance <= limit and best >= 0 else None
@@ -160,7 +168,10 @@ class NearestNodes:
             number, least = kernels.nearest_flat(self._nodes, self._count, query)
             return int(number), float(least)
         self.effort.by_bounds += 1
-        number, least, in_question, read = self._bounds.nearest(self._nodes, self._count, query, best, squared)
+        number, least, looked_at, in_question, read = self._bounds.nearest(
+            self._nodes, self._count, query, best, squared
+        )
+        self.effort.looked_at += looked_at
         self.effort.in_question += in_question
         self.effort.read += read
         return number, least
@@ -179,7 +190,7 @@ class _Marks:
         words = FLAT_BELOW // kernels.WORD
         self._marks: NDArray[np.uint64] = np.zeros((dimensions, self._intervals, words), dtype=np.uint64)
         self._common: NDArray[np.uint64] = np.zeros(words, dtype=np.uint64)
-        self._skipped = self._asked = self._found = 0
+        self._skipped = self._asked = self._found = self._answered = 0
 
     def put(self, number: int, vector: F64) -> None:
         """Mark a node where its vector now is."""
@@ -206,9 +217,13 @@ class _Marks:
         self._asked += 1
         self._found += candidates
         if self._asked == _WATCHED:
-            self.pays = self._found * _MARKS_WORTH < _WATCHED * count
-            self._asked = self._found = 0
+            self.pays = self._found * _MARKS_WORTH < _WATCHED * count and 2 * self._answered >= _WATCHED
+            self._asked = self._found = self._answered = 0
         return int(best), float(squared), int(candidates)
+
+    def note(self, *, answered: bool) -> None:
+        """Whether the candidates were all that had to be looked at."""
+        self._answered += answered
 
     def worth_asking(self) -> bool:
         """Always while marks pay; else now and then, to see whether they do by now."""
@@ -217,17 +232,24 @@ class _Marks:
 
 
 class _Bounds:
-    """Nodes in their principal directions, seven or eight bits each, for sums that are below the distances.
+    """Nodes in their principal directions, in blocks that lie together, seven or eight bits a number.
 
+    Boxes rule out blocks, in full precision; sums of codes, below the distances, rule out nodes of the others.
     Directions come in groups of eight, the widest first; a group has a step of its own, the smallest times a power of
     two, so that narrow directions are rounded less. `errors` holds, up to each group, the longest rounding error of
-    any node. The first `lead` groups are summed for all nodes, the rest only for those still in question.
+    any node. The first `lead` groups are summed, the rest only for nodes still in question.
+
+    Nodes that are added come into the last blocks, which are sorted whenever _TAIL have come; one that is moved stays
+    in its own, whose box grows. Blocks and directions are made anew when the nodes have become a quarter more, or have
+    been moved _MOVES times each.
     """
 
     def __init__(self, dimensions: int) -> None:
         self.lead = 0  # 0: there are no bounds yet
         self._n = dimensions
-        self._built_at = 0  # count of nodes when the directions were found
+        self._built_at = 0  # count of nodes when the blocks were made
+        self._moves = 0  # since then
+        self._known = self._sorted_up_to = 0  # nodes that have a place, and that lie together in theirs
         groups = -(-dimensions // kernels.GROUP)
         width = groups * kernels.GROUP
         self._centre: F64 = np.zeros(dimensions)
@@ -236,43 +258,61 @@ class _Bounds:
         self._steps: F64 = np.ones(groups)
         self._shifts: NDArray[np.int64] = np.zeros(groups, dtype=np.int64)
         self._errors: F64 = np.zeros(groups)
+        self._name: NDArray[np.int32] = np.zeros(0, dtype=np.int32)  # node by place
+        self._place: NDArray[np.int32] = np.zeros(0, dtype=np.int32)  # and back
         self._columns: NDArray[np.uint8] = np.zeros((0, width, kernels.BLOCK), dtype=np.uint8)
         self._rows: NDArray[np.float32] = np.zeros((0, width), dtype=np.float32)
-        self._sums: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
+        self._low: NDArray[np.float32] = np.zeros((width, 0), dtype=np.float32)
+        self._high: NDArray[np.float32] = np.zeros((width, 0), dtype=np.float32)
+        self._bound: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
         self._in_question: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
         self._nearness: F64 = np.zeros(0)
-        self._asked = self._in_question_sum = 0
+        self._asked = self._looked_at_sum = self._in_question_sum = 0
 
     def put(self, nodes: F64, count: int, number: int) -> None:
-        """Node `number` has been added or moved. The directions are found anew whenever the nodes have doubled."""
+        """Node `number` has been added (as the last of count) or moved."""
         if self._n > MOST_DIRECTIONS:
             return
-        if count >= max(FLAT_BELOW, 2 * self._built_at):
+        if number < self._built_at:
+            self._moves += 1
+        if count >= max(FLAT_BELOW, _GROWN * self._built_at) or self._moves > _MOVES * self._built_at > 0:
             self._build(nodes, count)
         elif self.lead:
             self._reserve(len(nodes))
-            self._encode(nodes, number, number + 1)
+            if number >= self._known:
+                self._name[number] = self._place[number] = number
+                self._known = count
+            place = int(self._place[number])
+            self._encode(nodes, place, place + 1)
+            if self._known - self._sorted_up_to >= _TAIL:
+                self._sort_tail(nodes)
 
-    def nearest(self, nodes: F64, count: int, query: F64, best: int, squared: float) -> tuple[int, float, int, int]:
-        """Number, squared distance, nodes in question, nodes read. best, squared: one known, or -1 and inf."""
-        number, least, in_question, read = kernels.nearest_bounded(
-            nodes, count, query, self._centre, self._axes, self._origin, self._steps, self._shifts, self._columns,
-            self._rows, self._errors, self._sums, self._in_question, self._nearness, self.lead, best, squared,
+    def nearest(
+        self, nodes: F64, count: int, query: F64, best: int, squared: float
+    ) -> tuple[int, float, int, int, int]:
+        """Number, squared distance, nodes looked at, in question, read. best, squared: one known, or -1 and inf."""
+        number, least, blocks, in_question, read = kernels.nearest_bounded(
+            nodes, count, query, self._centre, self._axes, self._origin, self._steps, self._shifts, self._name,
+            self._columns, self._rows, self._low, self._high, self._errors, self._bound, self._in_question,
+            self._nearness, self.lead, best, squared,
         )  # fmt: skip
         self._asked += 1
+        looked_at = blocks * kernels.BLOCK
+        self._looked_at_sum += looked_at
         self._in_question_sum += in_question
         if self._asked == _WATCHED // 4:
-            self._look_back(count)
-        return int(number), float(least), int(in_question), int(read)
+            self._look_back()
+        return int(number), float(least), int(looked_at), int(in_question), int(read)
 
-    def _look_back(self, count: int) -> None:
-        """One group more for all nodes if too many were in question; fewer are tried again when the nodes double."""
-        if self._in_question_sum > _MANY_IN_QUESTION * self._asked * count:
+    def _look_back(self) -> None:
+        """One group more if too many were in question; fewer are tried again with new blocks."""
+        if self._in_question_sum > _MANY_IN_QUESTION * self._looked_at_sum:
             self.lead = min(self.lead + 1, len(self._steps))
-        self._asked = self._in_question_sum = 0
+        self._asked = self._looked_at_sum = self._in_question_sum = 0
 
     def _build(self, nodes: F64, count: int) -> None:
-        self._built_at = count
+        self._built_at, self._moves = count, 0
+        self._known = self._sorted_up_to = count
         self.lead = max(self.lead - 1, 1)
         present = nodes[:count]
         self._centre = present.mean(axis=0)
@@ -285,23 +325,58 @@ class _Bounds:
         self._steps, self._shifts = _steps(widest)
         self._errors[:] = 0.0
         self._reserve(len(nodes))
+        self._low[:], self._high[:] = np.inf, -np.inf
+        self._name[:count] = _together(along)
+        self._place[self._name[:count]] = np.arange(count, dtype=np.int32)
         self._encode(nodes, 0, count)
+
+    def _sort_tail(self, nodes: F64) -> None:
+        """Let nodes that came since the directions were found lie together, too, in blocks of their own."""
+        self._sorted_up_to = self._known
+        first = -(-self._built_at // kernels.BLOCK) * kernels.BLOCK
+        self._low[:, first // kernels.BLOCK :], self._high[:, first // kernels.BLOCK :] = np.inf, -np.inf
+        here = self._name[first : self._known]
+        here[:] = here[_together(self._rows[first : self._known])]
+        self._place[here] = np.arange(first, self._known, dtype=np.int32)
+        self._encode(nodes, first, self._known)
 
     def _reserve(self, capacity: int) -> None:
         missing = capacity - len(self._rows)
         if missing > 0:
             self._rows = np.pad(self._rows, ((0, missing), (0, 0)))
+            self._name, self._place = np.pad(self._name, (0, missing)), np.pad(self._place, (0, missing))
             blocks = -(-capacity // kernels.BLOCK) - len(self._columns)
             self._columns = np.pad(self._columns, ((0, blocks), (0, 0), (0, 0)))
-            self._sums = np.zeros(capacity, dtype=np.int32)
+            self._low = np.pad(self._low, ((0, 0), (0, blocks)), constant_values=np.inf)
+            self._high = np.pad(self._high, ((0, 0), (0, blocks)), constant_values=-np.inf)
+            self._bound = np.zeros(len(self._columns), dtype=np.float32)
             self._in_question = np.zeros(capacity, dtype=np.int32)
             self._nearness = np.zeros(capacity)
 
     def _encode(self, nodes: F64, first: int, last: int) -> None:
         kernels.code_all(
-            nodes, first, last, self._centre, self._axes, self._origin, self._steps, self._columns, self._rows,
-            self._errors,
+            nodes, first, last, self._centre, self._axes, self._origin, self._steps, self._name, self._columns,
+            self._rows, self._low, self._high, self._errors,
         )  # fmt: skip
+
+
+def _together(along: NDArray[np.floating]) -> NDArray[np.int32]:
+    """An order of (N, m) vectors in which each BLOCK of them lies together: halved across the widest direction, and
+    the halves again."""
+    order = np.arange(len(along), dtype=np.int32)
+    waiting = [(0, len(along))]
+    while waiting:
+        first, last = waiting.pop()
+        blocks = -(-(last - first) // kernels.BLOCK)
+        if blocks < 2:
+            continue
+        part = order[first:last]
+        values = along[part]
+        across = values[:, int(np.argmax(np.var(values, axis=0)))]
+        middle = (blocks + 1) // 2 * kernels.BLOCK
+        order[first:last] = part[np.argpartition(across, middle)]
+        waiting += [(first, first + middle), (first + middle, last)]
+    return order
 
 
 def _steps(widths: F64) -> tuple[F64, NDArray[np.int64]]:

@@ -81,6 +81,63 @@ def test_nearest_is_that_of_brute_force(kind: str, reach: float | None) -> None:
     assert net.effort.queries == 400 * (1 if reach is None else 2)
 
 
+@pytest.mark.parametrize("kind", ["impressions", "uniform", "equal"])
+def test_a_hundred_thousand_answers_are_those_of_brute_force(kind: str) -> None:
+    random = np.random.default_rng(11)
+    count = 33_334
+    vectors = impressions(count + 2500, 7) if kind == "impressions" else random.random((count + 2500, 48))
+    if kind == "equal":  # quarters, whose sums are exact: many nodes equally far
+        vectors = np.round(vectors[:, :6] * 4.0) / 4.0
+    nodes, queries = vectors[:2500], vectors[2500:]
+    net = NearestNodes(vectors.shape[1])
+    for vector in nodes:
+        net.add(vector)
+    for first in range(0, count, 4096):
+        asked = queries[first : first + 4096]
+        about = np.sum(nodes**2, axis=1) - 2.0 * asked @ nodes.T + np.sum(asked**2, axis=1)[:, None]
+        for query, row in zip(asked, about):
+            near = np.flatnonzero(row <= row.min() + 1e-9)  # the product is off by less; exact among these
+            exact = np.sum((nodes[near] - query) ** 2, axis=1)
+            found = net.nearest(query)
+            assert found is not None
+            assert found[1] == pytest.approx(math.sqrt(exact.min()), abs=1e-12)
+            same = near[exact <= exact.min() + 1e-14]
+            assert found[0] == same[0] if len(same) == 1 or kind == "equal" else found[0] in same
+
+
+def test_exact_while_nodes_come_and_move() -> None:
+    """Through blocks that fill, are sorted, and are made anew."""
+    random = np.random.default_rng(12)
+    vectors = impressions(4000, 9)
+    net, nodes = NearestNodes(48), np.zeros((0, 48))
+    for k, vector in enumerate(vectors):
+        net.add(vector)
+        nodes = vectors[: k + 1]
+        if k > nearest.FLAT_BELOW and k % 8 == 0:
+            at = int(random.integers(k))
+            vectors[at] = np.clip(vectors[at] + random.normal(0.0, 0.02 if k % 16 else 0.5, 48), 0.0, 1.0)
+            net.move(at, vectors[at])
+            query = np.clip(vectors[int(random.integers(4000))] + random.normal(0.0, 0.01, 48), 0.0, 1.0)
+            assert net.nearest(query) == pytest.approx(brute(nodes, query))
+    for _ in range(9 * len(nodes)):
+        at = int(random.integers(len(nodes)))
+        vectors[at, 5] = random.random()
+        net.move(at, vectors[at])
+    for query in impressions(200, 10):
+        assert net.nearest(query) == pytest.approx(brute(vectors, query))
+
+
+def test_boxes_rule_out_most_nodes_where_vectors_lie_together() -> None:
+    vectors = impressions(20_500, 2)
+    net = NearestNodes(48)
+    for vector in vectors[:20_000]:
+        net.add(vector)
+    for vector in vectors[20_000:]:
+        net.nearest(vector)
+    assert net.effort.looked_at < 0.4 * 500 * 20_000
+    assert net.effort.read < 500 * 1.2
+
+
 def test_marks_answer_where_they_help_and_rest_where_they_do_not() -> None:
     random = np.random.default_rng(5)
     fine = NearestNodes(4, reach=0.02)
