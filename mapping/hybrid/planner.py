@@ -26,8 +26,9 @@ HALF_CELLS = math.sqrt(2.0)
 
 _USED_AGAIN = 1.4  # what an edge of an earlier way costs in the search for others
 _ELSEWHERE = 0.3  # of an alternative's length, at least
-_PULLS = 4
+_PULLS = 2
 _LANDMARKS = 8
+_CLEARANCES_KEPT = 4
 _NEAR_CELLS = 120  # ends nearer than this are joined on the grid, where the diagram may be a detour
 
 
@@ -60,7 +61,7 @@ class DiagramGraph:
     chain: (K,) cells of all edges, row * C + col.  along: (K,) length from node A, cells.  length, least_squared: (E,).
     chord: (E,) straight from node to node: what a way that is pulled taut is nearer to.
     first, link: edges of node n are link[first[n] : first[n + 1]].  leads_out: (N,) the edge out of a dead end, or -1.
-    mark: (L, N) float32 shortest way by chords to each node from some that lie far apart.
+    mark: (N, L) float32 shortest way by chords to each node from some that lie far apart.
     """
 
     node: I32
@@ -110,11 +111,12 @@ def graph_of(grid: VoronoiGrid) -> DiagramGraph:
 def _landmarks(first: I32, link: I32, edge: I32, cost: F64) -> NDArray[np.float32]:
     """Distances from nodes each of which is as far as can be from those before it."""
     nodes = len(first) - 1
-    mark = np.empty((min(_LANDMARKS, nodes), nodes), dtype=np.float32)
-    away = np.full(nodes, np.inf, dtype=np.float32)
+    mark = np.empty((nodes, min(_LANDMARKS, nodes)), dtype=np.float32)
+    away, row = np.full(nodes, np.inf, dtype=np.float32), np.empty(nodes, dtype=np.float32)
     source = 0
-    for row in mark:
+    for k in range(mark.shape[1]):
         kernels.distances_from(source, first, link, edge, cost, row)
+        mark[:, k] = row
         away = np.minimum(away, row)
         source = int(np.argmax(away))
     return mark
@@ -131,10 +133,18 @@ class Planner:
         self.resolution_m = check_resolution(resolution_m)
         self.grid, self.row0, self.col0 = grid, row0, col0
         self.graph = graph_of(grid)
+        graph = self.graph
         self._seen: I32 = np.zeros(grid.shape, dtype=np.int32)
         self._stamp = 0
         self._queue = np.empty(min(grid.field.squared.size, 1 << 20), dtype=np.int32)
         self._came = np.empty_like(self._queue)
+        self._tables: dict[float, _Tables] = {}
+        self._best, self._via = np.empty(len(graph.node)), np.empty(len(graph.node), dtype=np.int32)
+        self._state: I32 = np.zeros(len(graph.node), dtype=np.int32)
+        room = len(graph.link) + 3
+        self._heap, self._key = np.empty(room, dtype=np.int32), np.empty(room)
+        self._cells = np.empty(len(graph.chain) + len(graph.node), dtype=np.int32)
+        self._used = np.empty(len(graph.edge), dtype=np.int32)
 
     def plan(
         self, start: tuple[float, float], goal: tuple[float, float], *, clearance_m: float = 0.0, alternatives: int = 2
@@ -162,10 +172,11 @@ class Planner:
 
     def _cell(self, what: str, place: tuple[float, float], need: float) -> F64:
         """(row, col) in cells, a cell's centre at whole numbers; NoWayError if it is not free enough."""
-        at = np.array([place[1], place[0]], dtype=np.float64) / self.resolution_m - (self.row0, self.col0) - 0.5
-        if not np.isfinite(at).all():
+        if not (math.isfinite(place[0]) and math.isfinite(place[1])):
             raise ValueError(f"the {what} is no position: {place}")
-        row, col = (int(v) for v in np.floor(at + 0.5)) if np.abs(at).max() < 1e9 else (-1, -1)
+        at_row = place[1] / self.resolution_m - self.row0 - 0.5
+        at_col = place[0] / self.resolution_m - self.col0 - 0.5
+        row, col = math.floor(at_row + 0.5), math.floor(at_col + 0.5)
         height, width = self.grid.shape
         if not (0 <= row < height and 0 <= col < width) or self.grid.field.squared[row, col] == 0:
             raise NoWayError(f"the {what} ({place[0]:.2f}, {place[1]:.2f}) is not known to be free")
@@ -176,14 +187,14 @@ class Planner:
                 f"the {what} ({place[0]:.2f}, {place[1]:.2f}) has {have:.2f} m of clearance, "
                 f"asked are {(need - HALF_CELLS) * self.resolution_m:.2f} m"
             )
-        return at
+        return np.array((at_row, at_col))
 
     def _candidates(self, begin: F64, end: F64, need: float, tries: int) -> list[I32]:
         """Ways from cell to cell: straight or on the grid if the ends are near; on the graph, shortest first."""
-        squared, width = self.grid.field.squared, self.grid.shape[1]
+        width = self.grid.shape[1]
         start, goal = (int(r) * width + int(c) for r, c in (np.floor(begin + 0.5), np.floor(end + 0.5)))
         found: list[I32] = []
-        if kernels.sees(squared, need, *begin, *end):
+        if kernels.sees_by_room(self._tables_for(need).room, *begin, *end):
             found.append(np.empty(0, dtype=np.int32))
         need2 = math.ceil(need * need)
         if not found and math.hypot(*(end - begin)) <= _NEAR_CELLS:
@@ -201,32 +212,54 @@ class Planner:
         if inward is None:
             return found
         first, last = self._joints(int(outward[-1]), need2), self._joints(int(inward[-1]), need2)
-        along = self._within_edge(int(outward[-1]), int(inward[-1]), need2)
+        along = self._within_edge(first, last, need2)
         if along is not None:
             found.append(np.concatenate((outward, along, inward[::-1])))
         graph = self.graph
-        seeds, ends = (np.array([node for node, _, _ in joints], dtype=np.int32) for joints in (first, last))
-        seed_cost, end_cost = (np.array([way for _, way, _ in joints], dtype=np.float64) for joints in (first, last))
-        usable = np.empty(len(graph.edge), dtype=np.bool_)
-        kernels.open_edges(
-            graph.edge, graph.least_squared, need2, graph.leads_out, np.concatenate((seeds, ends)), usable
-        )
-        cost = graph.chord.copy()
-        via = np.empty(len(graph.node), dtype=np.int32)
-        cells = np.empty(len(graph.chain) + len(graph.node), dtype=np.int32)
-        used = np.empty(len(graph.edge), dtype=np.int32)
+        usable = self._tables_for(need).usable.copy()
+        for joint in (first, last):
+            kernels.open_ways_out(graph.edge, graph.least_squared, need2, graph.leads_out, joint.nodes, usable)
+        target = np.array(divmod(int(inward[-1]), width), dtype=np.float64)
+        cost = graph.chord if tries == 1 else graph.chord.copy()
         for _ in range(tries):
+            self._stamp += 2
             node, _total = kernels.shortest_way(
-                graph.first, graph.link, graph.edge, cost, usable, graph.mark, seeds, seed_cost, ends, end_cost, via
+                graph.first, graph.link, graph.edge, cost, usable, graph.node, graph.mark, first.nodes, first.ways,
+                last.nodes, last.ways, target, self._via, self._best, self._state, self._stamp, self._heap, self._key,
             )  # fmt: skip
             if node < 0:
                 break
-            k, m = kernels.cells_of_way(graph.node_cell, graph.edge, graph.chain, via, node, cells, used)
-            begun = int(np.flatnonzero(graph.node_cell == cells[k - 1])[0])
-            backwards = (inward, self._joint_cells(last, node), cells[:k], self._joint_cells(first, begun)[::-1])
-            found.append(np.concatenate((*backwards, outward[::-1]))[::-1])
-            cost[used[:m]] *= _USED_AGAIN
+            cells, used = self._cells, self._used
+            k, m = kernels.cells_of_way(graph.node_cell, graph.edge, graph.chain, self._via, node, cells, used)
+            begun = -int(graph.where.ravel()[cells[k - 1]]) - 1
+            found.append(
+                np.concatenate(
+                    (
+                        outward,
+                        self._to_node(first, begun),
+                        cells[:k][::-1],
+                        self._to_node(last, node)[::-1],
+                        inward[::-1],
+                    )
+                )
+            )
+            if tries > 1:
+                cost[used[:m]] *= _USED_AGAIN
         return found
+
+    def _tables_for(self, need: float) -> _Tables:
+        """Kept for the clearances asked for last; some milliseconds for millions of cells."""
+        tables = self._tables.pop(need, None)
+        if tables is None:
+            graph, room = self.graph, np.empty(self.grid.shape, dtype=np.uint8)
+            usable = np.empty(len(graph.edge), dtype=np.bool_)
+            kernels.open_edges(graph.edge, graph.least_squared, math.ceil(need * need), graph.leads_out, usable)
+            kernels.measure_room(self.grid.field.squared, need, room)
+            tables = _Tables(usable, room)
+        self._tables[need] = tables
+        if len(self._tables) > _CLEARANCES_KEPT:
+            del self._tables[next(iter(self._tables))]
+        return tables
 
     def _on_grid(self, start: int, goal: int, need2: int) -> I32:
         """Cells of the shortest way within a window around both; none if there is no such way."""
@@ -240,7 +273,7 @@ class Planner:
 
     def _reach(self, start: int, goal: int, need2: int) -> tuple[I32 | None, bool]:
         """Cells from start to the diagram (or to the goal: True)."""
-        self._stamp += 1
+        self._stamp += 2
         i = int(
             kernels.reach_line(
                 self.grid.field.squared,
@@ -256,55 +289,46 @@ class Planner:
         )
         if i < 0:
             return None, False
-        cells = []
-        met = int(self._queue[i]) == goal
-        while i >= 0:
-            cells.append(int(self._queue[i]))
-            i = int(self._came[i])
-        return np.array(cells[::-1], dtype=np.int32), met
+        cells = np.empty(i + 1, dtype=np.int32)
+        n = kernels.way_in_queue(self._queue, self._came, i, cells)
+        return cells[:n], int(cells[n - 1]) == goal
 
-    def _joints(self, cell: int, need2: int) -> list[tuple[int, float, I32]]:
-        """Nodes that a cell of the diagram leads to along its edge: node, length, cells on the way there."""
-        graph, flat = self.graph, self.grid.field.squared.ravel()
-        at = int(graph.where.ravel()[cell])
-        if at < 0:
-            return [(-at - 1, 0.0, np.empty(0, dtype=np.int32))]
-        e, k = self._edge_of(at - 1), at - 1
-        a, b, k0, k1 = (int(v) for v in graph.edge[e])
-        joints = []
-        for node, cells, length in (
-            (a, graph.chain[k0 : k + 1][::-1], float(graph.along[k])),
-            (b, graph.chain[k:k1], float(graph.length[e] - graph.along[k])),
-        ):
-            if flat[cells].min() >= need2 and flat[graph.node_cell[node]] >= need2:
-                joints.append((node, length, cells))
-        return joints
+    def _joints(self, cell: int, need2: int) -> _Joints:
+        graph = self.graph
+        nodes, ways = np.empty(2, dtype=np.int32), np.empty(2)
+        n, k = kernels.joints(
+            self.grid.field.squared, graph.where, graph.node_cell, graph.edge, graph.chain, graph.along, graph.length,
+            cell, need2, nodes, ways,
+        )  # fmt: skip
+        return _Joints(int(k), nodes[:n], ways[:n])
 
-    def _within_edge(self, first: int, last: int, need2: int) -> I32 | None:
+    def _within_edge(self, first: _Joints, last: _Joints, need2: int) -> I32 | None:
         """Cells between two cells of one edge, along it; None if they are not, or it is too narrow between."""
-        where = self.graph.where.ravel()
-        a, b = int(where[first]) - 1, int(where[last]) - 1
-        if a < 0 or b < 0 or self._edge_of(a) != self._edge_of(b):
+        graph, a, b = self.graph, first.k, last.k
+        if a < 0 or b < 0 or kernels.edge_of(graph.edge, a) != kernels.edge_of(graph.edge, b):
             return None
-        cells = self.graph.chain[a : b + 1] if a <= b else self.graph.chain[b : a + 1][::-1]
+        cells = graph.chain[a : b + 1] if a <= b else graph.chain[b : a + 1][::-1]
         return cells if self.grid.field.squared.ravel()[cells].min() >= need2 else None
 
-    def _edge_of(self, k: int) -> int:
-        return int(np.searchsorted(self.graph.edge[:, kernels.BEGIN], k, side="right")) - 1
-
-    def _joint_cells(self, joints: list[tuple[int, float, I32]], node: int) -> I32:
-        """Cells from the diagram cell of the joint to the node."""
-        return min((each for each in joints if each[0] == node), key=lambda each: each[1])[2]
+    def _to_node(self, joint: _Joints, node: int) -> I32:
+        """Cells from the diagram cell of a joint to the node, without the node."""
+        graph = self.graph
+        if joint.k < 0:
+            return graph.chain[:0]
+        a, b, begin, end = (int(v) for v in graph.edge[kernels.edge_of(graph.edge, joint.k)])
+        ways = joint.ways[joint.nodes == node]
+        back = node == a and (node != b or ways.min() == graph.along[joint.k])
+        return graph.chain[begin : joint.k + 1][::-1] if back else graph.chain[joint.k : end]
 
     def _taut(self, cells: I32, begin: F64, end: F64, need: float) -> F64:
         """(N, 2) corners of the way, in cells."""
         rows, cols = np.divmod(cells, self.grid.shape[1])
         n = len(cells) + 2
-        points = np.empty((3 * n + 2 * int(math.hypot(*(end - begin))) + 16, 2))
+        points = np.empty((n, 2))
         points[0], points[n - 1] = begin, end
         points[1 : n - 1, 0], points[1 : n - 1, 1] = rows, cols
         work = np.empty_like(points)
-        n = int(kernels.taut(self.grid.field.squared, need, points, n, _PULLS, work))
+        n = int(kernels.taut(self._tables_for(need).room, points, n, _PULLS, work))
         return points[:n].copy()
 
     def _describe(self, corners: F64) -> Way:
@@ -312,17 +336,33 @@ class Planner:
         squared, d = self.grid.field.squared, self.resolution_m
         spacing = 0.5 / d
         length = float(kernels.length_of(corners, len(corners)))
-        points = np.empty((int(length / spacing) + 2 * len(corners) + 2, 2))
-        n = int(kernels.refine(corners, len(corners), spacing, points))
-        points = points[:n]
-        xy = (points[:, ::-1] + 0.5 + (self.col0, self.row0)) * d
-        step = np.diff(xy, axis=0)
-        yaw = np.arctan2(step[:, 1], step[:, 0]) if len(step) else np.zeros(0)
-        yaw = np.append(yaw, yaw[-1] if len(yaw) else 0.0)
-        cells = np.floor(points + 0.5).astype(np.int64)
-        clear = np.maximum(np.sqrt(squared[cells[:, 0], cells[:, 1]]) - HALF_CELLS, 0.0) * d
+        most = int(length / spacing) + 2 * len(corners) + 2
+        pose, clear = np.empty((most, 3)), np.empty(most)
+        n = int(kernels.describe(squared, corners, len(corners), spacing, pose, clear, np.empty((most, 2))))
+        poses = np.empty((n, 3))
+        poses[:, 0] = (pose[:n, 1] + (0.5 + self.col0)) * d
+        poses[:, 1] = (pose[:n, 0] + (0.5 + self.row0)) * d
+        poses[:, 2] = pose[:n, 2]
+        clearance = np.maximum(clear[:n] - HALF_CELLS, 0.0) * d
         least = max(math.sqrt(kernels.least_along(squared, corners, len(corners))) - HALF_CELLS, 0.0) * d
-        return Way(np.column_stack((xy, yaw)), length * d, clear, least)
+        return Way(poses, length * d, clearance, least)
+
+
+@dataclass(frozen=True, slots=True)
+class _Tables:
+    """For one clearance. usable: (E,) edges wide enough, without dead ends.  room: (R, C) from kernels.measure_room."""
+
+    usable: Bools
+    room: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class _Joints:
+    """Where an end comes to the diagram. k: place in the chain, -1 at a node.  nodes, ways: next to it, how far."""
+
+    k: int
+    nodes: I32
+    ways: F64
 
 
 def _goes_elsewhere(corners: F64, other: F64) -> bool:

@@ -22,6 +22,7 @@ A, B, BEGIN, END = range(4)
 _ROW_STEP = (-1, -1, 0, 1, 1, 1, 0, -1)  # the eight neighbours in turn
 _COL_STEP = (0, 1, 1, 1, 0, -1, -1, -1)
 _FAR_AWAY = 1e30
+_PULL_CELLS = 1.0  # how exactly the farthest place in sight is sought
 
 
 @njit(cache=True, nogil=True)
@@ -235,49 +236,54 @@ def distances_from(source: Any, first: Any, link: Any, edge: Any, cost: Any, bes
 
 
 @njit(cache=True, nogil=True)
-def still_to_go(mark: Any, n: Any, ends: Any, end_cost: Any) -> float:
-    """No more than the way from node n over one of the ends: by the triangle of n, the end and each landmark."""
-    least = _FAR_AWAY
-    for i in range(ends.size):
-        bound = 0.0
-        for k in range(mark.shape[0]):
-            to_end, to_here = mark[k, ends[i]], mark[k, n]
-            if to_end < _FAR_AWAY / 2 and to_here < _FAR_AWAY / 2:
-                bound = max(bound, abs(np.float64(to_end) - np.float64(to_here)))
-        least = min(least, bound + end_cost[i])
-    return 0.999 * least  # what 32 bits may have rounded up
+def still_to_go(mark: Any, n: Any, node: Any, goal: Any, to_goal: Any) -> float:
+    """No more than the way from node n to the goal: straight, or by the triangle of both and each landmark.
+
+    goal: (2,) row, col.  to_goal: (L,) shortest way from each landmark.
+    """
+    bound = np.float32(0.0)
+    for k in range(mark.shape[1]):
+        bound = max(bound, abs(to_goal[k] - mark[n, k]))
+    dr, dc = node[n, 0] - goal[0], node[n, 1] - goal[1]
+    straight = math.sqrt(dr * dr + dc * dc)
+    if bound > _FAR_AWAY / 2:  # nothing joins one of them with a landmark
+        return straight
+    return float(max(straight, 0.9999 * bound))  # what 32 bits may have rounded up
 
 
 @njit(cache=True, nogil=True)
 def shortest_way(
-    first: Any, link: Any, edge: Any, cost: Any, open_edge: Any, mark: Any, seeds: Any, seed_cost: Any, ends: Any,
-    end_cost: Any, via: Any,
+    first: Any, link: Any, edge: Any, cost: Any, open_edge: Any, node: Any, mark: Any, seeds: Any, seed_cost: Any,
+    ends: Any, end_cost: Any, goal: Any, via: Any, best: Any, state: Any, stamp: int, heap: Any, key: Any,
 ) -> Any:  # fmt: skip
-    """A* over nodes. first, link: edges of node n are link[first[n]:first[n + 1]].  mark: (L, N) from distances_from.
+    """A* over nodes. first, link: edges of node n are link[first[n]:first[n + 1]].  mark: (N, L) from distances_from.
 
-    seeds, ends: nodes next to start and goal, with the way to or from there.  via: (N,) int32 out, the edge by which a
-    node was reached, -1 at seeds.  Returns the last node and the cost, (-1, huge) if there is no way.
+    seeds, ends: nodes next to start and goal, with the way to or from there.  goal: (2,) row, col.
+    via: (N,) int32 out, the edge by which a node was reached, -1 at seeds.  best (N,) float64, state (N,) int32, heap,
+    key (edges and seeds): work; states of this search are stamp and stamp + 1, all others are less.
+    Returns the last node and the cost, (-1, huge) if there is no way.
     """
-    nodes = first.size - 1
-    best = np.full(nodes, _FAR_AWAY)
-    done = np.zeros(nodes, dtype=np.bool_)
-    heap = np.empty(link.size + seeds.size + 1, dtype=np.int32)
-    key = np.empty(link.size + seeds.size + 1, dtype=np.float64)
+    met, done = stamp, stamp + 1
     size = np.zeros(1, dtype=np.int64)
+    to_goal = np.full(mark.shape[1], np.float32(_FAR_AWAY))
+    for i in range(ends.size):
+        for k in range(mark.shape[1]):
+            to_goal[k] = min(to_goal[k], mark[ends[i], k] + np.float32(end_cost[i]))
     for i in range(seeds.size):
         n = seeds[i]
-        if seed_cost[i] < best[n]:
+        if state[n] < met or seed_cost[i] < best[n]:
             best[n] = seed_cost[i]
+            state[n] = met
             via[n] = -1
-            push(heap, key, size, best[n] + still_to_go(mark, n, ends, end_cost), n)
+            push(heap, key, size, best[n] + still_to_go(mark, n, node, goal, to_goal), n)
     last, total = -1, _FAR_AWAY
     while size[0] > 0:
         if key[0] >= total:
             break
         n = pop(heap, key, size)
-        if done[n]:
+        if state[n] == done:
             continue
-        done[n] = True
+        state[n] = done
         for i in range(ends.size):
             if ends[i] == n and best[n] + end_cost[i] < total:
                 last, total = n, best[n] + end_cost[i]
@@ -287,10 +293,11 @@ def shortest_way(
                 continue
             other = edge[e, B] if edge[e, A] == n else edge[e, A]
             reached = best[n] + cost[e]
-            if reached < best[other]:
+            if state[other] < met or (state[other] == met and reached < best[other]):
                 best[other] = reached
+                state[other] = met
                 via[other] = e
-                push(heap, key, size, reached + still_to_go(mark, other, ends, end_cost), other)
+                push(heap, key, size, reached + still_to_go(mark, other, node, goal, to_goal), other)
     return last, total
 
 
@@ -326,10 +333,15 @@ def find_dead_ends(first: Any, link: Any, edge: Any, leads_out: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def open_edges(edge: Any, least: Any, need2: int, leads_out: Any, from_nodes: Any, usable: Any) -> None:
-    """usable: (E,) bool out: edges wide enough, without dead ends but for the ways out from these nodes."""
+def open_edges(edge: Any, least: Any, need2: int, leads_out: Any, usable: Any) -> None:
+    """usable: (E,) bool out: edges wide enough, without dead ends."""
     for e in range(edge.shape[0]):
         usable[e] = least[e] >= need2 and leads_out[edge[e, A]] != e and leads_out[edge[e, B]] != e
+
+
+@njit(cache=True, nogil=True)
+def open_ways_out(edge: Any, least: Any, need2: int, leads_out: Any, from_nodes: Any, usable: Any) -> None:
+    """Open the ways that lead out of the dead ends in which these nodes lie, as far as they are wide enough."""
     for i in range(from_nodes.size):
         n = from_nodes[i]
         while leads_out[n] >= 0:
@@ -338,6 +350,60 @@ def open_edges(edge: Any, least: Any, need2: int, leads_out: Any, from_nodes: An
                 break
             usable[e] = True
             n = edge[e, B] if edge[e, A] == n else edge[e, A]
+
+
+@njit(cache=True, nogil=True)
+def way_in_queue(queue: Any, came: Any, i: Any, cells: Any) -> Any:
+    """The cells from the first of a search to the one in place i of its queue; how many. cells: (K,) int32 out."""
+    n = 0
+    while i >= 0:
+        cells[n] = queue[i]
+        n += 1
+        i = came[i]
+    cells[:n] = cells[:n][::-1].copy()
+    return n
+
+
+@njit(cache=True, nogil=True)
+def joints(
+    squared: Any, where: Any, node_cell: Any, edge: Any, chain: Any, along: Any, length: Any, cell: int, need2: int,
+    nodes: Any, ways: Any,
+) -> Any:  # fmt: skip
+    """Nodes that a cell of the diagram leads to along its edge; how many, and its place in the chain (-1 at a node).
+
+    nodes: (2,) int32, ways: (2,) float64 out, the length to there.
+    """
+    flat = squared.reshape(-1)
+    at = where.reshape(-1)[cell]
+    if at < 0:
+        nodes[0], ways[0] = -at - 1, 0.0
+        return 1, -1
+    k = at - 1
+    e = edge_of(edge, k)
+    n = 0
+    for side in range(2):
+        end = edge[e, A] if side == 0 else edge[e, B]
+        first, last = (edge[e, BEGIN], k) if side == 0 else (k, edge[e, END] - 1)
+        wide = flat[node_cell[end]] >= need2
+        for i in range(first, last + 1):
+            wide = wide and flat[chain[i]] >= need2
+        if wide:
+            nodes[n], ways[n] = end, along[k] if side == 0 else length[e] - along[k]
+            n += 1
+    return n, k
+
+
+@njit(cache=True, nogil=True)
+def edge_of(edge: Any, k: Any) -> Any:
+    """The edge that cell k of the chain is on."""
+    low, high = 0, edge.shape[0]
+    while high - low > 1:
+        middle = (low + high) >> 1
+        if edge[middle, BEGIN] <= k:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 @njit(cache=True, nogil=True)
@@ -419,36 +485,104 @@ def sees(squared: Any, need: float, r0: float, c0: float, r1: float, c1: float) 
     """Whether the straight way between two points (in cells, a cell's centre at whole numbers) crosses only cells whose
     distance is at least `need`. Every cell that the line touches is looked at, but for those that are far enough from
     obstacles because one before them is farther still."""
-    length = math.hypot(r1 - r0, c1 - c0)
-    need2 = need * need
-    if squared[math.floor(r0 + 0.5), math.floor(c0 + 0.5)] < need2:
+    need2, far2 = need * need, (need + 3.4143) ** 2
+    r, c = math.floor(r0 + 0.5), math.floor(c0 + 0.5)
+    last_r, last_c = math.floor(r1 + 0.5), math.floor(c1 + 0.5)
+    if squared[last_r, last_c] < need2:
         return False
-    if length == 0.0:
-        return True
-    ur, uc = (r1 - r0) / length, (c1 - c0) / length
-    t = 0.0
-    while t < length:
-        r, c = math.floor(r0 + t * ur + 0.5), math.floor(c0 + t * uc + 0.5)
+    dr, dc = r1 - r0, c1 - c0
+    length = math.sqrt(dr * dr + dc * dc)
+    # How far along the line a row and a column take, and where it leaves those of this cell.
+    per_r = length / abs(dr) if dr != 0.0 else _FAR_AWAY
+    per_c = length / abs(dc) if dc != 0.0 else _FAR_AWAY
+    step_r, step_c = (1 if dr > 0.0 else -1), (1 if dc > 0.0 else -1)
+    leave_r = (0.5 + step_r * (r - r0)) * per_r
+    leave_c = (0.5 + step_c * (c - c0)) * per_c
+    while True:
         value = squared[r, c]
         if value < need2:
             return False
-        ahead = math.sqrt(value) - need - 1.4143
-        if ahead > 2.0:
-            t += ahead
-            continue
-        leave = _FAR_AWAY  # where the line leaves this cell
-        if ur != 0.0:
-            leave = (r + (0.5 if ur > 0.0 else -0.5) - r0) / ur
-        if uc != 0.0:
-            leave = min(leave, (c + (0.5 if uc > 0.0 else -0.5) - c0) / uc)
-        t = max(leave, t) + 1e-6
-    return bool(squared[math.floor(r1 + 0.5), math.floor(c1 + 0.5)] >= need2)
+        if value > far2:
+            t = (
+                min(leave_r, leave_c) + math.sqrt(value) - need - 2.8285
+            )  # a cell's diagonal less, t may be past the cell
+            if t >= length:
+                return True
+            if t > min(leave_r, leave_c):
+                r, c = math.floor(r0 + t / length * dr + 0.5), math.floor(c0 + t / length * dc + 0.5)
+                leave_r = (0.5 + step_r * (r - r0)) * per_r
+                leave_c = (0.5 + step_c * (c - c0)) * per_c
+                continue
+        if min(leave_r, leave_c) >= length:
+            return True
+        if abs(leave_r - leave_c) < 1e-6:  # through a corner
+            r, c = r + step_r, c + step_c
+            leave_r, leave_c = leave_r + per_r, leave_c + per_c
+        elif leave_r < leave_c:
+            r, leave_r = r + step_r, leave_r + per_r
+        else:
+            c, leave_c = c + step_c, leave_c + per_c
 
 
 @njit(cache=True, nogil=True)
-def straighten(squared: Any, need: float, point: Any, n: int, out: Any) -> Any:
+def measure_room(squared: Any, need: float, room: Any) -> None:
+    """room: (R, C) uint8 out, 0 where the distance is below `need`, else 1 + how many whole cells a way may go on from
+    anywhere in the cell without looking."""
+    need2 = need * need
+    told = np.empty(1 << 16, dtype=np.uint8)
+    for value in range(told.size):
+        more = math.sqrt(value) - need - 1.4143
+        told[value] = 0 if value < need2 else min(1 + max(int(more), 0), 255)
+    rows, cols = squared.shape
+    for r in range(rows):
+        for c in range(cols):
+            room[r, c] = told[min(squared[r, c], told.size - 1)]
+
+
+@njit(cache=True, nogil=True)
+def sees_by_room(room: Any, r0: float, c0: float, r1: float, c1: float) -> bool:
+    """What `sees` says, with the table that measure_room made; both points within the grid."""
+    r, c = int(r0 + 0.5), int(c0 + 0.5)
+    if room[int(r1 + 0.5), int(c1 + 0.5)] == 0:
+        return False
+    dr, dc = r1 - r0, c1 - c0
+    length = math.sqrt(dr * dr + dc * dc)
+    if length == 0.0:
+        return True
+    ur, uc = dr / length, dc / length
+    per_r, per_c = 1.0 / max(abs(ur), 1e-30), 1.0 / max(abs(uc), 1e-30)
+    step_r, step_c = (1 if dr > 0.0 else -1), (1 if dc > 0.0 else -1)
+    leave_r = (0.5 + step_r * (r - r0)) * per_r
+    leave_c = (0.5 + step_c * (c - c0)) * per_c
+    while True:
+        value = room[r, c]
+        if value == 0:
+            return False
+        leave = min(leave_r, leave_c)
+        if value > 3:
+            t = leave + (value - 2.5)  # less what the line takes through this cell, at most, and 1
+            if t >= length:
+                return True
+            r, c = int(r0 + t * ur + 0.5), int(c0 + t * uc + 0.5)
+            leave_r = (0.5 + step_r * (r - r0)) * per_r
+            leave_c = (0.5 + step_c * (c - c0)) * per_c
+            continue
+        if leave >= length:
+            return True
+        if abs(leave_r - leave_c) < 1e-6:  # through a corner
+            r, c = r + step_r, c + step_c
+            leave_r, leave_c = leave_r + per_r, leave_c + per_c
+        elif leave_r < leave_c:
+            r, leave_r = r + step_r, leave_r + per_r
+        else:
+            c, leave_c = c + step_c, leave_c + per_c
+
+
+@njit(cache=True, nogil=True)
+def straighten(room: Any, point: Any, n: int, out: Any) -> Any:
     """Leave out every point that is not needed: from each, on to the farthest that it sees, sought in doubling steps.
 
+    room: (R, C) from measure_room.
     point: (N, 2) float64, each seeing the next.  out: (N, 2) float64 out; returns how many points are left.
     """
     out[0] = point[0]
@@ -459,11 +593,11 @@ def straighten(squared: Any, need: float, point: Any, n: int, out: Any) -> Any:
             ahead = min(i + step, n - 1)
             if ahead <= good:
                 break
-            if not sees(squared, need, point[i, 0], point[i, 1], point[ahead, 0], point[ahead, 1]):
+            if not sees_by_room(room, point[i, 0], point[i, 1], point[ahead, 0], point[ahead, 1]):
                 bad = ahead
                 while bad - good > 1:
                     middle = (good + bad) >> 1
-                    if sees(squared, need, point[i, 0], point[i, 1], point[middle, 0], point[middle, 1]):
+                    if sees_by_room(room, point[i, 0], point[i, 1], point[middle, 0], point[middle, 1]):
                         good = middle
                     else:
                         bad = middle
@@ -500,25 +634,65 @@ def length_of(point: Any, n: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def taut(squared: Any, need: float, point: Any, n: int, rounds: int, work: Any) -> Any:
+def pull(room: Any, point: Any, n: int, out: Any) -> Any:
+    """From each place straight on to the farthest of the way that it sees, on to the next corner and as far into the
+    run behind it as can be; how many corners are left.
+
+    point: (N, 2) float64, each seeing the next.  out: (M, 2) float64 out, as long as point.
+    """
+    out[0] = point[0]
+    m, ahead = 1, 1
+    r, c = point[0, 0], point[0, 1]
+    while True:
+        while ahead + 1 < n and sees_by_room(room, r, c, point[ahead + 1, 0], point[ahead + 1, 1]):
+            ahead += 1
+        r0, c0 = point[ahead, 0], point[ahead, 1]
+        if ahead == n - 1:
+            out[m, 0], out[m, 1] = r0, c0
+            return m + 1
+        dr, dc = point[ahead + 1, 0] - r0, point[ahead + 1, 1] - c0
+        length = math.sqrt(dr * dr + dc * dc)
+        seen, hidden = 0.0, 1.0
+        while (hidden - seen) * length > _PULL_CELLS:
+            middle = 0.5 * (seen + hidden)
+            if sees_by_room(room, r, c, r0 + middle * dr, c0 + middle * dc):
+                seen = middle
+            else:
+                hidden = middle
+        r, c = r0 + seen * dr, c0 + seen * dc
+        out[m, 0], out[m, 1] = r, c
+        m += 1
+        ahead += 1
+
+
+@njit(cache=True, nogil=True)
+def turned_round(point: Any, n: int) -> None:
+    """The way backwards, in place."""
+    for i in range(n // 2):
+        for k in range(2):
+            point[i, k], point[n - 1 - i, k] = point[n - 1 - i, k], point[i, k]
+
+
+@njit(cache=True, nogil=True)
+def taut(room: Any, point: Any, n: int, rounds: int, work: Any) -> Any:
     """Pull a way straight, from both ends in turn, until it gets no shorter; in place, and how many points it has.
 
-    point, work: (M, 2) float64, M at least twice the way's length in cells plus n.
+    point, work: (M, 2) float64, M at least n.
     """
-    n_work = straighten(squared, need, point, n, work)
-    point[:n_work] = work[:n_work]
-    n = n_work
-    before = length_of(point, n)
+    n = straighten(room, point, n, work)
+    before = length_of(work, n)
     for turn in range(rounds):
-        m = refine(point, n, 3.0 if turn % 2 == 0 else 4.7, work)
-        for i in range(m // 2):
-            for k in range(2):
-                work[i, k], work[m - 1 - i, k] = work[m - 1 - i, k], work[i, k]
-        n = straighten(squared, need, work, m, point)
+        turned_round(work, n)
+        n = pull(room, work, n, point)
         now = length_of(point, n)
-        if turn % 2 == 1 and now > before * 0.999:
-            break
-        before = now
+        work[:n] = point[:n]
+        if turn % 2 == 1:
+            if now > before * 0.999:
+                break
+            before = now
+    if rounds % 2 == 1:
+        turned_round(work, n)
+    point[:n] = work[:n]
     return n
 
 
@@ -528,19 +702,40 @@ def least_along(squared: Any, point: Any, n: int) -> Any:
     least = np.int64(squared[math.floor(point[0, 0] + 0.5), math.floor(point[0, 1] + 0.5)])
     for i in range(n - 1):
         r0, c0, r1, c1 = point[i, 0], point[i, 1], point[i + 1, 0], point[i + 1, 1]
-        length = math.hypot(r1 - r0, c1 - c0)
-        if length == 0.0:
-            continue
-        ur, uc = (r1 - r0) / length, (c1 - c0) / length
-        t = 0.0
-        while t < length:
-            r, c = math.floor(r0 + t * ur + 0.5), math.floor(c0 + t * uc + 0.5)
+        dr, dc = r1 - r0, c1 - c0
+        length = math.sqrt(dr * dr + dc * dc)
+        r, c = math.floor(r0 + 0.5), math.floor(c0 + 0.5)
+        per_r = length / abs(dr) if dr != 0.0 else _FAR_AWAY
+        per_c = length / abs(dc) if dc != 0.0 else _FAR_AWAY
+        step_r, step_c = (1 if dr > 0.0 else -1), (1 if dc > 0.0 else -1)
+        leave_r = (0.5 + step_r * (r - r0)) * per_r
+        leave_c = (0.5 + step_c * (c - c0)) * per_c
+        while min(leave_r, leave_c) < length:
+            if abs(leave_r - leave_c) < 1e-6:
+                r, c = r + step_r, c + step_c
+                leave_r, leave_c = leave_r + per_r, leave_c + per_c
+            elif leave_r < leave_c:
+                r, leave_r = r + step_r, leave_r + per_r
+            else:
+                c, leave_c = c + step_c, leave_c + per_c
             least = min(least, np.int64(squared[r, c]))
-            leave = _FAR_AWAY
-            if ur != 0.0:
-                leave = (r + (0.5 if ur > 0.0 else -0.5) - r0) / ur
-            if uc != 0.0:
-                leave = min(leave, (c + (0.5 if uc > 0.0 else -0.5) - c0) / uc)
-            t = max(leave, t) + 1e-6
         least = min(least, np.int64(squared[math.floor(r1 + 0.5), math.floor(c1 + 0.5)]))
     return least
+
+
+@njit(cache=True, nogil=True)
+def describe(squared: Any, corner: Any, n: int, spacing: float, pose: Any, clear: Any, point: Any) -> Any:
+    """Poses along a way of n corners, no farther apart than spacing: how many.
+
+    point: (K, 2) work.  pose: (K, 3) out, row, col and the angle of going on, from columns to rows.  clear: (K,) out,
+    distance from obstacles' cells. All in cells.
+    """
+    m = refine(corner, n, spacing, point)
+    for i in range(m):
+        pose[i, 0], pose[i, 1] = point[i, 0], point[i, 1]
+        clear[i] = math.sqrt(squared[math.floor(point[i, 0] + 0.5), math.floor(point[i, 1] + 0.5)])
+        if i < m - 1:
+            pose[i, 2] = math.atan2(point[i + 1, 0] - point[i, 0], point[i + 1, 1] - point[i, 1])
+        else:
+            pose[i, 2] = pose[i - 1, 2] if m > 1 else 0.0
+    return m

@@ -167,13 +167,48 @@ def test_shortest_way_is_that_of_networkx() -> None:
         reference.add_edge(a, b, weight=min(known, float(graph.chord[e])))
     random, usable = np.random.default_rng(0), np.ones(len(graph.edge), dtype=np.bool_)
     via = np.empty(len(graph.node), dtype=np.int32)
+    best, state, stamp = np.empty(len(graph.node)), np.zeros(len(graph.node), dtype=np.int32), 0
+    heap, key = np.empty(len(graph.link) + 1, dtype=np.int32), np.empty(len(graph.link) + 1)
     lengths = dict(nx.all_pairs_dijkstra_path_length(reference))
     for a, b in random.integers(len(graph.node), size=(40, 2)).tolist():
+        stamp += 2
         last, total = kernels.shortest_way(
-            graph.first, graph.link, graph.edge, graph.chord, usable, graph.mark, np.array([a], dtype=np.int32),
-            np.zeros(1), np.array([b], dtype=np.int32), np.zeros(1), via,
+            graph.first, graph.link, graph.edge, graph.chord, usable, graph.node, graph.mark,
+            np.array([a], dtype=np.int32), np.zeros(1), np.array([b], dtype=np.int32), np.zeros(1),
+            graph.node[b].astype(np.float64), via, best, state, stamp, heap, key,
         )  # fmt: skip
         if b in lengths.get(a, {}):
             assert (last, total) == (b, pytest.approx(lengths[a][b]))
         else:
             assert last == -1
+
+
+@pytest.mark.parametrize("need", [math.sqrt(2.0), 3.3])
+def test_sight_by_the_table_is_that_by_distances(need: float) -> None:
+    """And neither overlooks a cell that the line crosses."""
+    grid = VoronoiGrid(cluttered(6))
+    squared = grid.field.squared
+    room = np.empty(grid.shape, dtype=np.uint8)
+    kernels.measure_room(squared, need, room)
+    random = np.random.default_rng(1)
+    places = np.argwhere(squared >= need * need)
+    seen = 0
+    for a, b in random.integers(len(places), size=(3000, 2)).tolist():
+        (r0, c0), (r1, c1) = (places[i] + random.uniform(-0.49, 0.49, 2) for i in (a, b))
+        told = kernels.sees_by_room(room, r0, c0, r1, c1)
+        assert told == kernels.sees(squared, need, r0, c0, r1, c1)
+        t = np.linspace(0.0, 1.0, 4000)
+        cells = np.floor(np.stack((r0 + t * (r1 - r0), c0 + t * (c1 - c0)), axis=-1) + 0.5).astype(int)
+        least = squared[cells[:, 0], cells[:, 1]].min()
+        if told:
+            assert least >= need * need
+            assert kernels.least_along(squared, np.array([[r0, c0], [r1, c1]]), 2) <= least
+        seen += told
+    assert 100 < seen < 2900
+
+
+def test_tables_of_many_clearances_are_let_go() -> None:
+    planner = Planner(VoronoiGrid(cluttered(3)), CELL_M)
+    lengths = [planner.plan(place(20, 20), place(60, 30), clearance_m=0.01 * k).way.length_m for k in range(8)]
+    assert len(planner._tables) <= 4
+    assert planner.plan(place(20, 20), place(60, 30), clearance_m=0.0).way.length_m == lengths[0]
