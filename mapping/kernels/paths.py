@@ -248,7 +248,7 @@ def still_to_go(mark: Any, n: Any, node: Any, goal: Any, to_goal: Any) -> float:
     straight = math.sqrt(dr * dr + dc * dc)
     if bound > _FAR_AWAY / 2:  # nothing joins one of them with a landmark
         return straight
-    by_marks: float = 0.9999 * bound  # what 32 bits may have rounded up
+    by_marks = np.float64(0.9999 * bound)  # what 32 bits may have rounded up
     return by_marks if by_marks > straight else straight
 
 
