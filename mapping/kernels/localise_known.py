@@ -19,6 +19,7 @@ UNKNOWN, FREE, WALL = 0, 1, 2
 EXPLAINED, THROUGH, UNEXPECTED, UNSEEN = 0, 1, 2, 3
 LEVELS = 3
 MATCH_LENGTH = 12  # pose (3), upper triangle of H (6), robust cost, partners, steps
+VAGUE_M = 0.2  # so far from a wall an end on unknown ground may lie behind it
 _GRAZING = 0.35  # a beam flatter than this to a wall (sine of the angle) may pass along it
 
 
@@ -180,14 +181,15 @@ def cast(
 @njit(cache=True, nogil=True)
 def judge(
     ox: Any, oy: Any, px: Any, py: Any, stride: int, kind: Any, room: Any, nearest: Any, surface: Any,
-    resolution_m: float, pose: Any, near_m: float, sigmas_m: Any, chance: Any, votes: Any,
+    resolution_m: float, pose: Any, near_m: float, apart_m: Any, log_apart: Any, log_else: Any, votes: Any,
 ) -> float:  # fmt: skip
     """Hold beams against the map at a pose (3,): each ends on a wall, went through one, met something that is not in
     the map, or looked where nothing is known. Returns their joint log likelihood; votes (4,) counts them.
 
-    ox, oy: (N,) where beams start, px, py: (N,) where they end, base frame.  chance: (4,) likelihood of each verdict;
-    that of EXPLAINED falls off with distance, half of it over sigmas_m[0] and half over sigmas_m[1], down to that of
-    UNEXPECTED.
+    ox, oy: (N,) where beams start, px, py: (N,) where they end, base frame.  log_apart: (M,) log likelihood of an end
+    so far from the nearest wall (apart_m, (M,) ascending, for a beam of no length; 8 % more for each metre of it),
+    linear in between.  log_else: (4,) of beams whose end has no wall near: EXPLAINED stands for unknown ground that has
+    a wall near, but not as near as VAGUE_M.
     """
     rows, cols = kind.shape
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -200,46 +202,59 @@ def judge(
         if z <= 0.0:
             continue
         slack = 0.35 + 0.04 * z
-        through, known = False, False
+        through, crossed_free = False, z <= slack
         if z > slack:
             _, what = cast(kind, room, nearest, surface, resolution_m, sx, sy, (ex - sx) / z, (ey - sy) / z, z - slack)
-            through, known = what == WALL, what == FREE
+            through, crossed_free = what == WALL, what == FREE
         if through:
             votes[THROUGH] += 1.0
-            total += math.log(chance[THROUGH])
+            total += log_else[THROUGH]
             continue
         u, v = math.floor(ex / resolution_m), math.floor(ey / resolution_m)
-        near = near_m + 0.01 * z
-        if u >= 0 and v >= 0 and u < cols and v < rows:
+        inside = u >= 0 and v >= 0 and u < cols and v < rows
+        free = inside and kind[v, u] == FREE
+        d, vague = math.inf, 1.0 + 0.08 * z
+        if inside and nearest[v, u] >= 0:
             at = nearest[v, u]
-            if at >= 0:
-                ax, ay = ex - surface[at, 0], ey - surface[at, 1]
-                d2 = ax * ax + ay * ay
-                if d2 <= near * near:
-                    votes[EXPLAINED] += 1.0
-                    sharp, wide = sigmas_m[0] + 0.005 * z, sigmas_m[1] + 0.005 * z
-                    fit = 0.5 * (math.exp(-0.5 * d2 / (sharp * sharp)) + math.exp(-0.5 * d2 / (wide * wide)))
-                    total += math.log(chance[EXPLAINED] * fit + chance[UNEXPECTED])
-                    continue
-            if (known or z <= slack) and kind[v, u] == FREE:
-                votes[UNEXPECTED] += 1.0
-                total += math.log(chance[UNEXPECTED])
-                continue
-        votes[UNSEEN] += 1.0
-        total += math.log(chance[UNSEEN])
+            d = math.sqrt((ex - surface[at, 0]) ** 2 + (ey - surface[at, 1]) ** 2)
+        if d <= near_m + 0.01 * z:
+            votes[EXPLAINED] += 1.0
+        elif free and crossed_free:
+            votes[UNEXPECTED] += 1.0
+        else:
+            votes[UNSEEN] += 1.0
+        d /= vague
+        if d >= apart_m[-1]:
+            total += log_else[UNEXPECTED] if free else log_else[UNSEEN]
+        elif inside and kind[v, u] == UNKNOWN and d >= VAGUE_M:
+            total += log_else[EXPLAINED]
+        else:
+            total += _between(apart_m, log_apart, d)
     return total
+
+
+@njit(cache=True, nogil=True)
+def _between(x: Any, y: Any, at: float) -> float:
+    """Linear interpolation; x (M,) ascending."""
+    if at <= x[0]:
+        return float(y[0])
+    n = 1
+    while n < len(x) - 1 and x[n] < at:
+        n += 1
+    return float(y[n - 1] + (y[n] - y[n - 1]) * (at - x[n - 1]) / (x[n] - x[n - 1]))
 
 
 @njit(cache=True, nogil=True)
 def judge_many(
     ox: Any, oy: Any, px: Any, py: Any, stride: int, kind: Any, room: Any, nearest: Any, surface: Any,
-    resolution_m: float, poses: Any, near_m: float, sigmas_m: Any, chance: Any, votes: Any, logs: Any,
+    resolution_m: float, poses: Any, near_m: float, apart_m: Any, log_apart: Any, log_else: Any,
+    votes: Any, logs: Any,
 ) -> None:  # fmt: skip
     """judge at poses (K, 3): votes (K, 4), logs (K,)."""
     for k in range(len(poses)):
         logs[k] = judge(
-            ox, oy, px, py, stride, kind, room, nearest, surface, resolution_m, poses[k], near_m, sigmas_m, chance,
-            votes[k],
+            ox, oy, px, py, stride, kind, room, nearest, surface, resolution_m, poses[k], near_m,
+            apart_m, log_apart, log_else, votes[k],
         )  # fmt: skip
 
 

@@ -20,8 +20,9 @@ class Evidence:
     """What a belief is judged by.
 
     lead: log of how much more likely the first place is than all its rivals together.  explained, through: shares of
-    beams that end on a wall of the map, and that went through one, over six key scans; explained_now over two.
-    keys: key scans there were to judge by.  challenged: the map has been searched for rivals.
+    beams that end on a wall of the map, and that went through one, over six key scans; explained_now over two, of which
+    the newest counts more while the robot stands.  keys: key scans there were to judge by.  challenged: the map has
+    been searched for rivals.
     """
 
     lead: float = 0.0
@@ -40,9 +41,9 @@ class Coefficients:
     fits: tuple[float, float, float]
 
 
-FITTED = Coefficients((2.17, 0.76, -1.13), (-3.1, 7.27, 0.93))
-LEAD = (-6.0, 10.0)  # beyond, a lead says no more
-MOST_KEYS = 16
+FITTED = Coefficients((3.42, 0.9, -1.16), (-7.02, 10.6, 1.33))
+LEAD = (-6.0, 12.0)  # beyond, a lead says no more
+MOST_KEYS = 32
 
 
 def features(evidence: Evidence) -> tuple[F64, F64]:

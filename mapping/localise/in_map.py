@@ -31,6 +31,7 @@ import math
 from collections import Counter, deque
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,11 @@ SAME_M = 0.3
 SAME_RAD = math.radians(8.0)
 RIVAL_M = 0.6  # a place so far off is another place, not a finer or coarser word for the same
 RIVAL_RAD = math.radians(15.0)
+CARRIED_FOR = 2  # key scans at least since the robot was carried away
+TURNED_RAD = math.radians(6.0)
+CLEARLY = 0.1  # so much more of a scan matches
+STOOD = 3
+FIRST = 8  # places that may have lost their heading in a turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +59,10 @@ class InMapSettings:
     """Defaults for every robot and building.
 
     key_*: a key scan so often.  window, forget: key scans that count, and what a key scan counts against the next.
-    beams_as_one: so many beams of a scan say as much as one that is independent.  most_per_key: no scan says more (log)
-    against a place.  places: followed at most.  margin: so much less likely than the best (log) and a place is given
-    up.  carried: log odds of not having been carried away: what a new place must make good against one that was sure.
+    beams_as_one, beams_as_witness: so many beams of a scan say as much as one that is independent, of where exactly a
+    place is and of which place is right.  most_per_key: no scan says more (log) against a place.  places: followed at
+    most.  margin: so much less likely than the best (log) and a place is given up.  carried: log odds of not having
+    been carried away, see `_Crowd.weight`; also what a new place must make good against one that was sure.
     search_*: from one search to the next while not sure, and while sure.  joined_m: way over which key scans are joined
     for a search.  point_sigma_m, floor_*: see `_corrected`.  odometry_*: standard deviations of a step.  sure, unsure:
     see the module.
@@ -64,14 +71,14 @@ class InMapSettings:
     key_m: float = 0.2
     key_rad: float = math.radians(8.0)
     key_s: float = 0.5
-    window: int = 16
-    forget: float = 0.92
+    window: int = 32
+    forget: float = 0.98
     beams_as_one: float = 14.0
-    most_per_key: float = 2.0
+    beams_as_witness: float = 30.0
+    most_per_key: float = 4.0
     places: int = 40
     margin: float = 16.0
     carried: float = 10.0
-    doubted: float = 3.0
     search_s: float = 1.0
     search_sure_s: float = 4.0
     lag_s: float = 0.4
@@ -170,11 +177,19 @@ class _Crowd:
         return (self.log, self.explained, self.through, self.unexpected)
 
     def weight(self, s: InMapSettings) -> F64:
-        """(K,) log of how likely each is, but for a constant."""
+        """(K,) log of how likely each is, but for a constant.
+
+        Either the robot was there all the time, or it was carried there: then the older key scans were made where they
+        fit best, and being carried must be made good by the newer ones.
+        """
         if not len(self):
             return self.prior
-        bounded = np.maximum(self.log, self.log.max(axis=0) - s.most_per_key)
-        return np.asarray(self.prior + bounded @ (s.forget ** np.arange(s.window)))
+        bounded = np.maximum(self.log, self.log.max(axis=0) - s.most_per_key) * s.forget ** np.arange(s.window)
+        whole = self.prior + bounded.sum(axis=1)
+        newer = np.cumsum(bounded, axis=1)
+        elsewhere = (whole[:, None] - newer).max(axis=0)  # older key scans, seen from the place that explains them best
+        carried = (newer + elsewhere)[:, CARRIED_FOR - 1 :].max(axis=1) - s.carried
+        return np.asarray(np.maximum(whole, carried))
 
 
 def _crowd_at(poses: F64, covariance: F64, window: int) -> _Crowd:
@@ -196,12 +211,13 @@ class Search:
     known: KnownMap
     settings: InMapSettings
     keys: tuple[_Key, ...]  # the newest first
+    joined: int  # so many of them are searched by; all of them judge what was found
     near: tuple[Pose2, float] | None
 
     def run(self) -> SearchResult:
         """Places at the newest key scan, with the evidence of all of them."""
         s, newest = self.settings, self.keys[0]
-        found = find_places(self.known, _joined(self.keys, s), near=self.near)
+        found = find_places(self.known, _joined(self.keys[: self.joined], s), near=self.near)
         if not len(found.poses):
             return SearchResult(self.number, newest.number, _crowd_at(np.zeros((0, 3)), _anywhere(), s.window))
         stride = 2 if len(newest.points) >= 60 else 1
@@ -243,13 +259,15 @@ class MapLocaliser:
         self._last_odom: Pose2 | None = None
         self._last_ns: int | None = None
         self._anchor: Pose2 | None = None  # odometry at the last key scan that was taken for way or turn
+        self._stood = 0  # key scans that took the place of the last one: the newest stands for them too
         self._next_key = 0
         self._next_search = 0
         self._outstanding: Search | None = None
         self._handed_out = True
         self._due_ns = 0
         self._searched_ns: int | None = None
-        self._challenged = False  # whether a search has been applied since the places were last thrown away
+        self._challenged = False  # whether a search has been applied since the places were last doubted
+        self._doubted: int | None = None  # the key scan at which a place that was sure became lost
         self._hint: tuple[Pose2, float] | None = None
         self._probability = 0.0
         self._evidence = Evidence()
@@ -323,7 +341,7 @@ class MapLocaliser:
     def _follow_first(self, points: Points) -> None:
         """Between key scans only the best place is laid on the map."""
         if len(self._crowd):
-            first = _corrected(self.known, points, self._crowd.rows(np.array([0])), self.settings)
+            first = _corrected(self.known, points, self._crowd.rows(np.array([0])), self.settings, turned=1)
             rest = self._crowd.rows(np.arange(1, len(self._crowd)))
             self._crowd = first.and_(rest)
 
@@ -332,11 +350,12 @@ class MapLocaliser:
         self._next_key += 1
         if instead:
             self._keys.popleft()
+            self._stood = min(self._stood + 1, STOOD)
         else:
-            self._anchor = key.odom_from_base
+            self._anchor, self._stood = key.odom_from_base, 0
         self._keys.appendleft(key)
         if len(self._crowd):
-            crowd = _corrected(self.known, key.points, self._crowd, self.settings)
+            crowd = _corrected(self.known, key.points, self._crowd, self.settings, turned=FIRST)
             self._crowd = _ranked(
                 _with_evidence(self.known, key.points, crowd, self.settings, instead=instead), self.settings
             )
@@ -349,10 +368,11 @@ class MapLocaliser:
         before = self.state
         if self._probability >= s.sure:
             self.state = State.SURE
+            self._doubted = None
         elif before is State.SURE and self._probability < s.unsure:
             self.state = State.LOST
             self.events["lost"] += 1
-            self._forget_evidence()
+            self._look_anew()
         if self.state is not before:
             self.events[f"became_{self.state.value}"] += 1
 
@@ -364,13 +384,13 @@ class MapLocaliser:
         weight = crowd.weight(self.settings)
         away = np.hypot(*(crowd.poses[:, :2] - crowd.poses[0, :2]).T) > RIVAL_M
         rival = away | (np.abs(wrap_angles(crowd.poses[:, 2] - crowd.poses[0, 2])) > RIVAL_RAD)
-        n = min(len(self._keys), 6)
+        n, last = len(self._keys), min(len(self._keys), 6)
         return Evidence(
             lead=float(weight[0] - np.logaddexp.reduce(weight[rival])) if rival.any() else self.settings.margin,
-            explained=float(crowd.explained[0, :n].mean()),
-            explained_now=float(crowd.explained[0, : min(n, 2)].mean()),
-            through=float(crowd.through[0, :n].mean()),
-            keys=len(self._keys),
+            explained=float(crowd.explained[0, :last].mean()),
+            explained_now=float(np.average(crowd.explained[0, : min(n, 2)], weights=[1 + self._stood, 1][:n])),
+            through=float(crowd.through[0, :last].mean()),
+            keys=n,
             challenged=self._challenged,
         )
 
@@ -385,7 +405,10 @@ class MapLocaliser:
             if (stamp_ns - self._searched_ns) * 1e-9 < (s.search_sure_s if calm else s.search_s):
                 return
         floor = self.known.floor_m2 if self._hint is None else min(self.known.floor_m2, 4.0 * self._hint[1] ** 2)
-        self._outstanding = Search(self._next_search, self.known, s, tuple(self._keys), self._hint)
+        joined = len(self._keys)
+        if self._doubted is not None and self._next_search % 2 == 0:
+            joined = max(1, sum(key.number > self._doubted - CARRIED_FOR for key in self._keys))
+        self._outstanding = Search(self._next_search, self.known, s, tuple(self._keys), joined, self._hint)
         self._next_search += 1
         self._hint = None
         self._handed_out = False
@@ -401,7 +424,8 @@ class MapLocaliser:
 
     def search_now(self, near: tuple[Pose2, float] | None = None) -> Search | None:
         """A search by the key scans there are, beside the own ones; nothing changes. None before the first scan."""
-        return Search(-1, self.known, self.settings, tuple(self._keys), near) if self._keys else None
+        keys = tuple(self._keys)
+        return Search(-1, self.known, self.settings, keys, len(keys), near) if keys else None
 
     def abandon(self) -> None:
         """The search that is due came to nothing."""
@@ -443,16 +467,13 @@ class MapLocaliser:
     def _throw_away(self) -> None:
         self._crowd = _crowd_at(np.zeros((0, 3)), _anywhere(), self.settings.window)
         self._keys.clear()
+        self._doubted = None
         self._start_anew()
 
-    def _forget_evidence(self) -> None:
-        """What was seen before is no evidence for where the robot is now: keep the places, and the newest scan."""
-        newest = self._keys[0]
-        self._keys.clear()
-        self._keys.append(newest)
-        kept = [np.where(np.arange(self.settings.window) == 0, column, 0.0) for column in self._crowd.seen()]
-        prior = np.where(np.arange(len(self._crowd)) == 0, self.settings.doubted, 0.0)
-        self._crowd = _Crowd(self._crowd.poses, self._crowd.covariance, prior, *kept)
+    def _look_anew(self) -> None:
+        """What was believed is doubted: it is sure again only after a search. Nothing that was seen is forgotten, for
+        most doubts are the map's fault; but a search by all of it finds no robot that was carried away."""
+        self._doubted = self._keys[0].number
         self._start_anew()
 
     def _start_anew(self) -> None:
@@ -514,25 +535,64 @@ def _moved(crowd: _Crowd, step: Pose2, s: InMapSettings, *, blind_s: float = 0.0
     return replace(crowd, poses=poses, covariance=covariance)
 
 
-def _corrected(known: KnownMap, points: Points, crowd: _Crowd, s: InMapSettings) -> _Crowd:
+def _corrected(known: KnownMap, points: Points, crowd: _Crowd, s: InMapSettings, *, turned: int = 0) -> _Crowd:
     """Every place laid on the map, held by what was expected as far as that is sure.
 
     The information of a match is its Hessian over point_sigma_m squared, for every beams_as_one beams one: neighbouring
-    beams err together, by the map's errors and by their own.
+    beams err together, by the map's errors and by their own. turned: the first so many places are also laid from
+    headings to the left and to the right; see `_turned_back`.
     """
     if not len(crowd):
         return crowd
-    unit = s.point_sigma_m**2 * s.beams_as_one
     stride = 1 if len(crowd) <= 4 or len(points) < 60 else 2
+    laid = _laid(known, points, crowd, s, stride)
+    if turned:
+        first = np.arange(min(turned, len(crowd)))
+        better = _turned_back(known, points, crowd.rows(first), laid, s, stride)
+        laid = _Laid(*(np.concatenate((new, old[len(first) :])) for new, old in zip(better, laid)))
+    good = laid.matched > 0.0
+    return replace(
+        crowd,
+        poses=np.where(good[:, None], laid.poses, crowd.poses),
+        covariance=np.where(good[:, None, None], laid.covariance, crowd.covariance),
+    )
+
+
+class _Laid(NamedTuple):
+    """Places laid on the map: poses (K, 3), covariance (K, 3, 3), matched (K,) how well, from 0 to 1."""
+
+    poses: F64
+    covariance: F64
+    matched: F64
+
+
+def _laid(known: KnownMap, points: Points, crowd: _Crowd, s: InMapSettings, stride: int) -> _Laid:
+    unit = s.point_sigma_m**2 * s.beams_as_one
     priors: F64 = np.asarray(
         np.linalg.inv(crowd.covariance + np.diag([1e-6, 1e-6, 1e-8])) * (unit / stride), dtype=float
     )
     fits = lay(known, points, crowd.poses, priors=priors, stride=stride)
     good = fits.solved & (fits.share > 0.2) & (fits.mean_cost < 0.7)
-    information = (priors + fits.hessian) * (stride / unit)
-    covariance = np.where(good[:, None, None], np.linalg.inv(information), crowd.covariance)
-    poses = np.where(good[:, None], fits.poses, crowd.poses)
-    return replace(crowd, poses=poses, covariance=covariance)
+    covariance: F64 = np.asarray(np.linalg.inv((priors + fits.hessian) * (stride / unit)), dtype=float)
+    return _Laid(fits.poses, covariance, np.where(good, fits.share * (1.0 - fits.mean_cost), 0.0))
+
+
+def _turned_back(known: KnownMap, points: Points, crowd: _Crowd, laid: _Laid, s: InMapSettings, stride: int) -> _Laid:
+    """The first rows of `laid`, where a heading TURNED to either side fits clearly better: that one.
+
+    Wheels lose degrees in a turn, and laying on walls catches 4 or 5 only: beyond that it is caught between walls.
+    """
+    best = _Laid(*(column[: len(crowd)] for column in laid))
+    for side in (-TURNED_RAD, TURNED_RAD):
+        aside = replace(
+            crowd,
+            poses=crowd.poses + np.array([0.0, 0.0, side]),
+            covariance=crowd.covariance + np.diag([0.0, 0.0, TURNED_RAD**2]),
+        )
+        other = _laid(known, points, aside, s, stride)
+        clear = other.matched > best.matched + CLEARLY
+        best = _Laid(*(np.where(clear.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(other, best)))
+    return best
 
 
 def _with_evidence(known: KnownMap, points: Points, crowd: _Crowd, s: InMapSettings, *, instead: bool) -> _Crowd:
@@ -540,7 +600,7 @@ def _with_evidence(known: KnownMap, points: Points, crowd: _Crowd, s: InMapSetti
     if not len(crowd):
         return crowd
     said = hold(known, points, crowd.poses, stride=1 if len(crowd) <= 4 or len(points) < 60 else 2)
-    log = said.log / said.beams * min(len(points), 90) / s.beams_as_one
+    log = said.log / said.beams * min(len(points), 90) / s.beams_as_witness
 
     def put(kept: F64, new: F64) -> F64:
         return np.concatenate((new[:, None], kept[:, 1:] if instead else kept[:, :-1]), axis=1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,10 +20,22 @@ from numpy.typing import NDArray
 from mapping.frames import Pose2, wrap_angle
 from mapping.grids.patch import GridPatch
 from mapping.kernels import localise_known as kernels
-from mapping.localise.in_map import InMapSettings, Located, MapLocaliser, SearchIsDueError, SearchResult, State
+from mapping.localise.in_map import (
+    InMapSettings,
+    Located,
+    MapLocaliser,
+    SearchIsDueError,
+    SearchResult,
+    State,
+    _corrected,
+    _Crowd,
+    _crowd_at,
+)
 from mapping.localise.known_map import (
     BEAMS,
     BLOCK,
+    LOG_APART,
+    LOG_ELSE,
     KnownMap,
     Points,
     digest_of,
@@ -220,6 +233,30 @@ def test_beams_bear_witness(rooms: KnownMap) -> None:
     assert away.unseen[0] == 1.0
 
 
+def test_a_beam_says_what_its_end_is_apart_from_the_walls() -> None:
+    """One beam from (4, 4.5) to the east in a room whose wall stands at x = 6, ended short of it or beyond."""
+    cells = np.zeros((180, 240), dtype=np.int8)
+    cells[:, 120:124] = 100
+    cells[:, 124:] = -1
+    known = known_map(GridPatch(0.05, 0, 0, cells))
+
+    def log_of(range_m: float) -> float:
+        points = points_of(
+            np.zeros(1), np.array([range_m]), Pose2(), nearest_m=0.05, farthest_m=20.0, most=BEAMS
+        )  # fmt: skip
+        return float(hold(known, points, row(Pose2(4.0, 4.5, 0.0))).log[0])
+
+    on_it = 2.1  # the surface is the middle of what is drawn
+    assert log_of(on_it) == pytest.approx(LOG_APART[0])
+    halfway = 0.175 * (1.0 + 0.08 * 1.9)  # from 0.1 to 0.25, and less sharp the longer the beam
+    assert log_of(on_it - halfway) == pytest.approx(0.5 * (LOG_APART[1] + LOG_APART[2]), abs=0.05)
+    assert log_of(1.0) == pytest.approx(LOG_ELSE[kernels.UNEXPECTED])
+    assert log_of(2.42) == pytest.approx(LOG_ELSE[kernels.EXPLAINED])  # just behind the wall
+    assert log_of(4.0) == pytest.approx(LOG_ELSE[kernels.THROUGH])
+    fine = [log_of(range_m) for range_m in np.arange(on_it, 0.5, -0.02)]
+    assert all(near >= far for near, far in pairwise(fine))
+
+
 def test_search_finds_what_a_literal_search_finds() -> None:
     """Every cell and heading tried one by one gives the same best score."""
     patch = floor_plan(0.1)
@@ -360,6 +397,50 @@ def test_a_robot_carried_away_says_so_and_comes_back() -> None:
 
 def _at(way: list[Pose2], k: int) -> Pose2:
     return way[min(max(k, 0), len(way) - 1)]
+
+
+def test_what_was_seen_outlasts_a_doubt() -> None:
+    """Somebody stands in front of the laser for a while: lost, then sure of the same place again at once."""
+    way = way_through(ROUND)
+    localiser = MapLocaliser(KNOWN)
+    found = drive(localiser, way[:80])
+    assert found[-1].state is State.SURE
+    odom, stamp_ns = localiser._last_odom, 80 * PERIOD_NS
+    assert odom is not None
+    crowded = points_of(BEARINGS, np.full(len(BEARINGS), 0.6), Pose2(), nearest_m=0.05, farthest_m=20.0, most=BEAMS)
+    states, pending = [], None
+    for k in range(30):
+        if localiser.is_due(stamp_ns):
+            localiser.apply(localiser._outstanding.run() if pending is None else pending)  # type: ignore[union-attr]
+        points = crowded if k < 15 else points_at(way[79])
+        states.append(localiser.add_scan(stamp_ns, points, odom).state)
+        work = localiser.take_work()
+        pending = pending if work is None else work.run()
+        stamp_ns += PERIOD_NS
+    assert State.LOST in states[:15]
+    assert State.SURE in states[15:25]
+    assert off(localiser.located(stamp_ns), way[79]) < 0.1
+    assert len(localiser._keys) > 5
+
+
+def test_being_carried_must_be_made_good_once() -> None:
+    """Three places and six key scans, the newest first: one was right until four ago, one is since, one is never."""
+    s = InMapSettings(window=6, forget=1.0, most_per_key=5.0, carried=7.0)
+    log = np.array([[-4.0, -4, -4, 0, 0, 0], [0.0, 0, 0, -3, -3, -3], [-4.0, -4, -4, -4, -4, -4]])
+    none = np.zeros_like(log)
+    crowd = _Crowd(np.zeros((3, 3)), np.zeros((3, 3, 3)), np.zeros(3), log, none, none, none)
+    assert crowd.weight(s).tolist() == [-12.0, -7.0, -19.0]
+    assert crowd.weight(replace(s, carried=20.0)).tolist() == [-12.0, -9.0, -24.0]
+
+
+def test_a_heading_that_was_lost_in_a_turn_is_found_again() -> None:
+    truth, s = Pose2(3.0, 4.5, 0.4), InMapSettings()
+    for lost_deg in (-9.0, 9.0):
+        at = np.array([[truth.x_m, truth.y_m, truth.yaw_rad + math.radians(lost_deg)]])
+        crowd = _crowd_at(at, np.diag([0.02**2, 0.02**2, math.radians(1.0) ** 2]), s.window)
+        placed = _corrected(KNOWN, points_at(truth), crowd, s, turned=1)
+        assert abs(math.degrees(wrap_angle(float(placed.poses[0, 2]) - truth.yaw_rad))) < 2.0
+        assert math.hypot(placed.poses[0, 0] - truth.x_m, placed.poses[0, 1] - truth.y_m) < 0.1
 
 
 def test_a_robot_elsewhere_is_never_sure() -> None:
