@@ -156,7 +156,7 @@ def off(case: Case, index: int, located: Located) -> tuple[float, float]:
 
 def is_right(case: Case, index: int, located: Located) -> bool:
     metres, radians = off(case, index, located)
-    return metres < RIGHT_M and radians < RIGHT_RAD
+    return bool(metres < RIGHT_M and radians < RIGHT_RAD)
 
 
 def driven(case: Case) -> F64:

@@ -62,7 +62,8 @@ class InMapSettings:
     beams_as_one, beams_as_witness: so many beams of a scan say as much as one that is independent, of where exactly a
     place is and of which place is right.  most_per_key: no scan says more (log) against a place.  places: followed at
     most.  margin: so much less likely than the best (log) and a place is given up.  carried: log odds of not having
-    been carried away, see `_Crowd.weight`; also what a new place must make good against one that was sure.
+    been carried away, see `_Crowd.weight`; also what a new place must make good against one that is sure.  doubted: the
+    same against one that was sure until it was lost.
     search_*: from one search to the next while not sure, and while sure.  joined_m: way over which key scans are joined
     for a search.  point_sigma_m, floor_*: see `_corrected`.  odometry_*: standard deviations of a step.  sure, unsure:
     see the module.
@@ -79,6 +80,7 @@ class InMapSettings:
     places: int = 40
     margin: float = 16.0
     carried: float = 10.0
+    doubted: float = 3.0
     search_s: float = 1.0
     search_sure_s: float = 4.0
     lag_s: float = 0.4
@@ -457,6 +459,8 @@ class MapLocaliser:
         self._challenged = True
         if self.state is State.SURE:
             crowd = replace(crowd, prior=np.full(len(crowd), -self.settings.carried))
+        elif self._doubted is not None:
+            crowd = replace(crowd, prior=np.full(len(crowd), -self.settings.doubted))
         together = self._crowd.and_(crowd)
         if len(together):
             self._crowd = _ranked(together, self.settings)
