@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE, DATA = ROOT / "docs" / "fault-ledger.md", ROOT / "docs" / "fault-ledger.json"
 
 SEEN_MOST_MS = 500
-SEEN_LEAST_MS = 200  # a shorter pause is one of the machine, not of a device that answers 30 times a second or more
+SEEN_LEAST_MS = 60  # shorter pauses are those of USB hubs, adapters and schedulers
 BACK_MS = 2000
 BASELINE_S, FAULT_S = 0.8, 0.8
 SLACK_M = 0.05  # sonars' noise of 5 mm, ten sigma

@@ -40,6 +40,15 @@ class SetBaudRate:
 
 WireT = TypeVar("WireT", bytes, CanFrame)
 
+LEAST_SILENCE_NS = 60_000_000
+"""Shorter pauses are those of USB hubs, adapters and schedulers (tens of milliseconds), not of devices."""
+MOST_SILENCE_NS = 500_000_000
+
+
+def silence_limit(period_ns: int) -> int:
+    """When a device with this period counts as silent: after three periods, at least 60 ms, at most 500 ms."""
+    return min(max(3 * period_ns, LEAST_SILENCE_NS), MOST_SILENCE_NS)
+
 
 class Conversation(Protocol[WireT]):
     """One device on a wire. See the module's docstring for how it is driven."""
@@ -66,7 +75,8 @@ class Conversation(Protocol[WireT]):
 
     @property
     def silence_limit_ns(self) -> int:
-        """No reading for longer than this means that the device is lost: 3 periods, never above 500 ms."""
+        """No reading for longer than this means that the device is silent: see silence_limit. The reader allows three
+        of the periods that it measures, if those are longer."""
 
     def connected(self, now_ns: int) -> None:
         """The wire was opened or reopened: forget partial messages, begin with reset and resynchronisation."""

@@ -26,7 +26,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from drivers.conversation import SetBaudRate
+from drivers.conversation import MOST_SILENCE_NS, SetBaudRate, silence_limit
 from drivers.errors import FrameError
 from drivers.readings import (
     ChainReading,
@@ -57,8 +57,6 @@ _GIVE_UP_AFTER = 2
 _LONGEST_LINE = 64
 _LOWEST_BAUD, _HIGHEST_BAUD = 1200, 4_000_000
 _FARTHEST_CM = 1199  # below every line speed
-_LEAST_SILENCE_NS = 200 * _MS
-_MOST_SILENCE_NS = 500 * _MS
 _LONG_AGO = -(1 << 62)
 
 INVALID_COMMAND = "Invalid Command"
@@ -206,7 +204,7 @@ class ArduinoBridgeConversation:
     def silence_limit_of(self, kind: type[Reading]) -> int:
         """Three periods of that kind of reading."""
         periods = [task.period_ns for task in self._tasks if _LETTERS[task.letter] is kind]
-        return min(max(3 * min(periods, default=_MOST_SILENCE_NS), _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        return silence_limit(min(periods, default=MOST_SILENCE_NS))
 
     # ---- how it is driven
 

@@ -29,7 +29,7 @@ from functools import partial, reduce
 from typing import Literal
 
 from drivers.canopen_sdo import ANSWER_ID, TIMED_OUT, Download, SdoAborted, SdoClient, SdoDone, Upload
-from drivers.conversation import CanFrame, SetBaudRate
+from drivers.conversation import CanFrame, SetBaudRate, silence_limit
 from drivers.readings import AngleReading, ClockFit, Identity, LinkState, Reading, SourceCounters, WheelReading
 
 _SYNC_ID = 0x080
@@ -44,16 +44,14 @@ _FULL_RANGE = 1 << 32
 _TELLS_FULL_RANGE = (0, _FULL_RANGE - 1)  # 6002h has 32 bits, in which 2^32 cannot be said
 
 _HEARTBEAT_MS = 100
-# Missing readings are noticed after 200 ms. A node is given up, and with it the run of its count, only after five
-# heartbeats: until then it may have been the bus or this machine that paused.
+# Missing readings are noticed after 60 ms or three periods. A node is given up, and with it the run of its count, only
+# after five heartbeats: until then it may have been the bus or this machine that paused.
 _LIFE_NS = 5 * _HEARTBEAT_MS * 1_000_000
 _SEARCH_PERIOD_NS = 250_000_000
 _REFUSED_RETRY_NS = 1_000_000_000
 _START_REPEAT_NS = 300_000_000
 _SYNC_PATIENCE_NS = 1_000_000_000  # started, alive, but no TPDO2 for so long: this node does not know SYNC
-_SHORTEST_ANSWER_LIMIT_NS = 50_000_000
-_LEAST_SILENCE_NS = 200_000_000  # a pause of the interpreter is no lost device
-_MOST_SILENCE_NS = 500_000_000
+_SHORTEST_ANSWER_LIMIT_NS = 40_000_000  # so that one lost answer is no silence yet
 _UNKNOWN_STEPS = 65536
 _JUMP_FACTOR = 10.0  # a count that moved ten times as far as the fastest wheel was set anew
 _NEVER = 1 << 62
@@ -492,7 +490,7 @@ class _Cia406Conversation(ABC):
 
     @property
     def silence_limit_ns(self) -> int:
-        return min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        return silence_limit(self._period_ns)
 
     # ---- how it is driven
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
 
-from drivers.conversation import CanFrame, SetBaudRate
+from drivers.conversation import CanFrame, SetBaudRate, silence_limit
 from drivers.errors import FrameError
 from drivers.readings import ClockFit, Identity, LinkState, Reading, SourceCounters, WheelReading
 from drivers.wheel_counts import Meeting, WheelCounts
@@ -33,8 +33,6 @@ _OVERDUE_NS = 1_000 * _MS
 _LOST_NS = 500 * _MS  # five heartbeats
 _COUNT_PATIENCE_NS = 300 * _MS  # both live, but one does not answer 0Ah for so long: it does not know it
 _SENT_BY_ITSELF_NS = 50 * _MS  # position came unasked within this: it is not asked for
-_LEAST_SILENCE_NS = 200 * _MS
-_MOST_SILENCE_NS = 500 * _MS
 _COARSE_TURNS = 8192.0
 _MOST_TURNS = float(1 << 23)  # beyond, a float has no fraction of a turn left
 _NEVER_HEARD = -(1 << 62)
@@ -196,7 +194,7 @@ class ODrivePairConversation:
 
     @property
     def silence_limit_ns(self) -> int:
-        return min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        return silence_limit(self._period_ns)
 
     # ---- how it is driven
 

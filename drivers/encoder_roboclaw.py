@@ -24,7 +24,7 @@ from enum import IntEnum
 from typing import Literal
 
 from drivers.checksums import crc16_ccitt
-from drivers.conversation import SetBaudRate
+from drivers.conversation import SetBaudRate, silence_limit
 from drivers.errors import FrameError
 from drivers.readings import ClockFit, Identity, LinkState, Reading, SourceCounters, WheelReading
 from drivers.wheel_counts import Meeting, WheelCounts
@@ -40,8 +40,6 @@ _LOST_AFTER = 8  # unanswered questions in a row
 _BOTH_TRIES = 3  # so often 78 unanswered by a controller that tells its version: an older one
 _VERSION_TRIES = 2
 _BATTERY_PERIOD_NS = 5_000 * _MS
-_LEAST_SILENCE_NS = 200 * _MS
-_MOST_SILENCE_NS = 500 * _MS
 
 
 class Command(IntEnum):
@@ -168,7 +166,7 @@ class RoboClawConversation:
 
     @property
     def silence_limit_ns(self) -> int:
-        return min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        return silence_limit(self._period_ns)
 
     # ---- how it is driven
 

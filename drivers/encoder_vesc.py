@@ -17,7 +17,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from drivers.conversation import CanFrame, SetBaudRate
+from drivers.conversation import CanFrame, SetBaudRate, silence_limit
 from drivers.readings import ClockFit, Identity, LinkState, Reading, SourceCounters
 from drivers.wheel_counts import Meeting, WheelCounts
 
@@ -25,8 +25,6 @@ STATUS_1, STATUS_5 = 9, 27
 TICKS_PER_ELECTRICAL_TURN = 6
 _MS = 1_000_000
 _OVERDUE_NS = 1_000 * _MS
-_LEAST_SILENCE_NS = 200 * _MS
-_MOST_SILENCE_NS = 500 * _MS
 _NEVER_HEARD = -(1 << 62)
 _SIDES = ("left", "right")
 
@@ -122,7 +120,7 @@ class VescPairConversation:
 
     @property
     def silence_limit_ns(self) -> int:
-        return min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        return silence_limit(self._period_ns)
 
     # ---- how it is driven
 

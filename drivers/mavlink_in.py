@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 
-from drivers.conversation import SetBaudRate
+from drivers.conversation import MOST_SILENCE_NS, SetBaudRate, silence_limit
 from drivers.mavlink_frames import (
     ATTITUDE,
     COMMAND_LONG,
@@ -49,8 +49,6 @@ _MS = 1_000_000
 _SECOND_NS = 1_000 * _MS
 _REQUEST_PERIOD_NS = 2 * _SECOND_NS
 _OVERDUE_NS = 2 * _SECOND_NS
-_LEAST_SILENCE_NS = 200 * _MS
-_MOST_SILENCE_NS = 500 * _MS
 _LONG_AGO = -(1 << 62)
 _COMPONENT = 196  # MAV_COMP_ID_OBSTACLE_AVOIDANCE
 _TYPE_ONBOARD, _TYPE_GCS, _AUTOPILOT_INVALID, _STATE_ACTIVE, _VERSION = 18, 6, 8, 4, 3
@@ -155,14 +153,14 @@ class MavlinkConversation:
 
     @property
     def silence_limit_ns(self) -> int:
-        return min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        return silence_limit(self._period_ns)
 
     def silence_limit_of(self, kind: type[Reading]) -> int:
         """Three periods: as asked for, or as sensors of distance were heard to take, which may be slow by nature."""
         if kind is not ChainReading:
             return self.silence_limit_ns
-        slowest_ns = max(self._intervals_ns.values(), default=_MOST_SILENCE_NS)
-        return min(max(3 * round(slowest_ns), self.silence_limit_ns), _MOST_SILENCE_NS)
+        slowest_ns = max(self._intervals_ns.values(), default=MOST_SILENCE_NS)
+        return min(max(3 * round(slowest_ns), self.silence_limit_ns), MOST_SILENCE_NS)
 
     # ---- how it is driven
 
@@ -289,7 +287,7 @@ class MavlinkConversation:
         last_ns = self._sensor_ns.get(sensor)
         self._sensor_ns[sensor] = stamp_ns
         if last_ns is not None:
-            interval_ns = min(stamp_ns - last_ns, _MOST_SILENCE_NS)
+            interval_ns = min(stamp_ns - last_ns, MOST_SILENCE_NS)
             known_ns = self._intervals_ns.get(sensor, interval_ns)
             self._intervals_ns[sensor] = known_ns + 0.2 * (interval_ns - known_ns)
 

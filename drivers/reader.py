@@ -3,8 +3,8 @@
 One thread per wire; several conversations may share a CAN wire, each then sees every frame. The loop never gives up:
 
     port cannot be opened or is lost   ABSENT at once; tried again after 0.1 s, later up to 1 s, for ever
-    no reading within silence_limit    SILENT at once, while it goes on asking; after 0.4 s more it starts from reset,
-                                       then again after up to 1 s each
+    no reading within silence_limit    SILENT at once, while it goes on asking; after 0.4 s more (0.6 s in all, at
+       (three of its usual periods)    least) it starts from reset, then again after up to 1 s each
     set-up takes for ever              the conversation starts from reset after 20 s
     an exception in a conversation     a bug: logged with its traceback, counted, that conversation alone restarts
 
@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Generic
 
-from drivers.conversation import Conversation, SetBaudRate, WireT
+from drivers.conversation import MOST_SILENCE_NS, Conversation, SetBaudRate, WireT
 from drivers.errors import PortError
 from drivers.ports import Clock, Direction, Port, Tap
 from drivers.readings import ClockFit, DeviceEvent, Identity, LinkState, Reading, SourceCounters
@@ -34,6 +34,8 @@ POLL_PERIOD_NS = 20_000_000  # requests() is called at least so often
 _FIRST_BACKOFF_NS = 100_000_000
 _LONGEST_BACKOFF_NS = 1_000_000_000
 _SILENCE_PATIENCE_NS = 400_000_000  # a device that only paused keeps its set-up, and wheels their count
+_SHORTEST_BEFORE_RESET_NS = 600_000_000
+_INTERVALS_KEPT = 9  # the middle one of so many is a source's usual period
 _OWN_PAUSE_NS = 30_000_000  # so much later than it should be, the loop itself was held up
 _SETUP_LIMIT_NS = 20_000_000_000  # spin-up and the search for a line speed included
 _EVENT_PERIOD_NS = 1_000_000_000  # between two events that tell the same state in other words
@@ -329,6 +331,7 @@ class _Source(Generic[WireT]):
         self._bugs = 0
         self._last_reading_ns: int | None = None
         self._rate = _Rate()
+        self._usual = _UsualPeriod()
 
     # ---- what the loop tells
 
@@ -429,17 +432,22 @@ class _Source(Generic[WireT]):
                 self._loop_trouble = None  # it answers again
             if state is LinkState.RUNNING:
                 self._alive_ns = max(self._alive_ns, now_ns)
-        limit_ns = self._conversation.silence_limit_ns
+        limit_ns = self._silence_limit_ns()
         if state is LinkState.RUNNING:
             silence_ns = now_ns - self._alive_ns
             if silence_ns >= limit_ns:
                 self._loop_trouble = f"no reading for {silence_ns / 1e9:.2f} s: check its power and cable"
-                if silence_ns >= limit_ns + _SILENCE_PATIENCE_NS:
+                if silence_ns >= max(limit_ns + _SILENCE_PATIENCE_NS, _SHORTEST_BEFORE_RESET_NS):
                     self._restart_when_due(now_ns)
             else:
                 self._loop_trouble = None
         elif now_ns - self._setup_ns > _SETUP_LIMIT_NS:
             self._restart(now_ns)
+
+    def _silence_limit_ns(self) -> int:
+        """What the conversation says, or three of the periods that were measured where the device takes longer."""
+        told_ns = self._conversation.silence_limit_ns
+        return max(told_ns, min(3 * self._usual.period_ns, MOST_SILENCE_NS))
 
     def _restart_when_due(self, now_ns: int) -> None:
         """Silence: start anew, but no more often than the back-off allows: a device may come and go."""
@@ -469,6 +477,7 @@ class _Source(Generic[WireT]):
         self._loop_trouble = None
         self._restart_backoff.note_life(stamp_ns)
         self._rate.count(stamp_ns)
+        self._usual.count(stamp_ns)
 
     def _note_bug(self, now_ns: int, error: Exception) -> None:
         """Called while handling the exception. The conversation is left alone for a second, then restarted."""
@@ -581,6 +590,22 @@ class _Rate:
         if self._hz == 0.0 and self._last_ns > self._window_ns:  # within the first second
             return self._count * 1e9 / (self._last_ns - self._window_ns)
         return self._hz
+
+
+class _UsualPeriod:
+    """The middle one of the newest intervals between readings; 0 until there are enough. One pause does not move it."""
+
+    def __init__(self) -> None:
+        self.period_ns = 0
+        self._last_ns: int | None = None
+        self._intervals: deque[int] = deque(maxlen=_INTERVALS_KEPT)
+
+    def count(self, stamp_ns: int) -> None:
+        if self._last_ns is not None:
+            self._intervals.append(stamp_ns - self._last_ns)
+            if len(self._intervals) == _INTERVALS_KEPT:
+                self.period_ns = sorted(self._intervals)[_INTERVALS_KEPT // 2]
+        self._last_ns = stamp_ns
 
 
 class _RateLimitedLog:

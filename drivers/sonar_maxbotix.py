@@ -25,7 +25,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.conversation import SetBaudRate
+from drivers.conversation import LEAST_SILENCE_NS, SetBaudRate, silence_limit
 from drivers.errors import FrameError
 from drivers.readings import (
     ChainReading,
@@ -47,8 +47,6 @@ _BYTE_NS = 10 * 1_000_000_000 // BAUD_BPS
 _LONGEST_LINE = 160
 _OVERDUE_NS = 1_000 * _MS  # a sensor measures and calibrates itself for 0.25 s first
 _STALE_AFTER = 3  # so many periods
-_LEAST_SILENCE_NS = 200 * _MS
-_MOST_SILENCE_NS = 500 * _MS
 _LONG_AGO = -(1 << 62)
 
 
@@ -177,7 +175,7 @@ class MaxBotixConversation:
 
     @property
     def silence_limit_ns(self) -> int:
-        limit_ns = min(max(3 * self._period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        limit_ns = silence_limit(self._period_ns)
         if self._form == "labelled":  # other channels' lines come in between
             return limit_ns
         return max(limit_ns, self._period_ns * 3 // 2)  # a list, or one slow sensor, may come less often than that
@@ -286,7 +284,7 @@ class MaxBotixConversation:
     def _gone_silent(self, now_ns: int) -> list[ChainReading]:
         """Channels that no longer come while others do: told once as STALE."""
         expected = self._channels if self._channels is not None else self._seen_ns.keys()
-        limit_ns = max(_STALE_AFTER * self._period_ns, _LEAST_SILENCE_NS)
+        limit_ns = max(_STALE_AFTER * self._period_ns, LEAST_SILENCE_NS)
         for channel in expected:
             self._seen_ns.setdefault(channel, now_ns)
         gone = [

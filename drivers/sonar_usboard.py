@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from drivers.conversation import CanFrame, SetBaudRate
+from drivers.conversation import CanFrame, SetBaudRate, silence_limit
 from drivers.errors import FrameError
 from drivers.readings import (
     ChainReading,
@@ -61,8 +61,6 @@ _SLOWEST_LISTENING_S = 0.16  # three intervals must fit in the 500 ms within whi
 _LEGACY_AFTER = 3  # GET_DATA unanswered so often: perhaps an old board
 _MISSED_ROUNDS = 2  # so often the others answered without this group
 _DEFAULT_FIRE_NS = 20_000_000
-_LEAST_SILENCE_NS = 200_000_000  # a pause of the interpreter is no lost device
-_MOST_SILENCE_NS = 500_000_000
 _NEVER = 1 << 62
 
 
@@ -159,7 +157,7 @@ class _Board:
     @property
     def silence_limit_ns(self) -> int:
         period_ns = self._period_ns()
-        limit_ns = min(max(3 * period_ns, _LEAST_SILENCE_NS), _MOST_SILENCE_NS)
+        limit_ns = silence_limit(period_ns)
         return max(limit_ns, period_ns * 3 // 2)  # only when told to listen to a board that speaks less often
 
     def connected(self, now_ns: int) -> None:

@@ -8,7 +8,9 @@ What this emulator does that a naive one would not:
 - Odometry is dead reckoning of its own wheels, forward-right-down: y and yaw grow to the right.
 - A rangefinder that hears nothing says one more than its maximum; one that something is too near for says its minimum
   less one.
-- Its clock counts from its start and may drift; TIMESYNC is answered.
+- Its clock counts from its start and may drift; TIMESYNC and PING are answered.
+- Ground tools find what they ask for first: AUTOPILOT_VERSION when requested, a short list of parameters (ArduPilot
+  tells whole numbers as floats of their value, PX4 as floats of their bits), an empty mission.
 - OBSTACLE_DISTANCE is taken as the autopilot at hand takes it. ArduPilot: any frame as the body's, values from minimum
   to maximum only, increment_f unless it is nearly 0, at most a full circle. PX4: frames 0, 1 and 12 only, the first two
   turned by the yaw; 65535 leaves a bin as it was, values from the maximum on are clear; increment_f only above 0.
@@ -20,6 +22,7 @@ What this emulator does that a naive one would not:
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -40,6 +43,9 @@ FRAMES_OF_PX4 = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_LOCAL_NED, mavlink.
 ORIENTATION_DEG = 45.0
 NOT_KNOWN = math.nan
 MAX_HZ = 1000.0
+
+INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
+Parameter = tuple[str, int, float]  # name, type, value
 
 Kind = Literal["ardupilot", "px4"]
 KINDS: tuple[Kind, ...] = ("ardupilot", "px4")
@@ -120,6 +126,7 @@ class MavlinkAutopilot:
         self._random = np.random.default_rng(seed)
         self._codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
         self._codec.robust_parsing = True
+        self._parameters = _usual_parameters(kind, system)
         self._start(0)
         self._powered = False  # until the first step tells the time
 
@@ -270,6 +277,22 @@ class MavlinkAutopilot:
             )  # fmt: skip
         return out
 
+    def _version(self) -> Any:
+        as_value = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+        as_bits = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+        can = mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2 | (as_bits if self.kind == "px4" else as_value)
+        release = 4 << 24 | 5 << 16 | mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL
+        if self.kind == "px4":
+            release = 1 << 24 | 14 << 16 | mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL
+        own = [0] * 8
+        return self._codec.autopilot_version_encode(can, release, 0, 0, 0, own, own, own, 0, 0, 0x5EED)
+
+    def _parameter(self, place: int) -> Any:
+        name, kind, value = self._parameters[place]
+        if kind == INT32 and self.kind == "px4":
+            value = struct.unpack("<f", struct.pack("<i", round(value)))[0]
+        return self._codec.param_value_encode(name.encode("ascii"), value, kind, len(self._parameters), place)
+
     def _boot_ms(self, now_ns: int) -> int:
         return self.clock_us(now_ns) // 1000 & 0xFFFFFFFF
 
@@ -295,20 +318,58 @@ class MavlinkAutopilot:
             self._judge(message, now_ns)
         if kind == "TIMESYNC" and message.tc1 == 0:
             self._say(self._codec.timesync_encode(self.clock_us(now_ns) * 1000, message.ts1), now_ns)
+        if kind == "PING" and message.target_system == 0:
+            sender = message.get_srcSystem(), message.get_srcComponent()
+            self._say(self._codec.ping_encode(message.time_usec, message.seq, *sender), now_ns)
+        if getattr(message, "target_system", None) in (0, self.system):
+            self._answer(kind, message, now_ns)
         if kind == "COMMAND_LONG" and message.target_system in (0, self.system):
             self._command(message, now_ns)
 
+    def _answer(self, kind: str, message: Any, now_ns: int) -> None:
+        """What ground tools ask for before they show anything."""
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        if kind == "MISSION_REQUEST_LIST":
+            self._say(self._codec.mission_count_encode(*sender, 0, message.mission_type), now_ns)
+        if kind == "PARAM_REQUEST_LIST":
+            for place in range(len(self._parameters)):
+                self._say(self._parameter(place), now_ns)
+        if kind in ("PARAM_REQUEST_READ", "PARAM_SET"):
+            names = [name for name, _, _ in self._parameters]
+            place = getattr(message, "param_index", -1)
+            if place < 0 and message.param_id in names:
+                place = names.index(message.param_id)
+            if not 0 <= place < len(names):
+                return
+            if kind == "PARAM_SET":
+                self._set_parameter(place, message.param_value)
+            self._say(self._parameter(place), now_ns)
+
+    def _set_parameter(self, place: int, told: float) -> None:
+        name, kind, _ = self._parameters[place]
+        if kind == INT32 and self.kind == "px4":
+            told = struct.unpack("<i", struct.pack("<f", told))[0]
+        self._parameters[place] = (name, kind, told)
+
     def _command(self, message: Any, now_ns: int) -> None:
-        """SET_MESSAGE_INTERVAL and REQUEST_MESSAGE for what is sent at all; everything else is unsupported."""
+        """SET_MESSAGE_INTERVAL for what is sent at all, REQUEST_MESSAGE for that and the version; else unsupported."""
         stream = next((s for s in self._streams if s.message_id == message.param1), None)
+        asks_version = message.command == mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
+            message.command == mavlink.MAV_CMD_REQUEST_MESSAGE
+            and message.param1 == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        )
         result = mavlink.MAV_RESULT_UNSUPPORTED
         if message.command in (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE):
             result = mavlink.MAV_RESULT_DENIED if stream is None else mavlink.MAV_RESULT_ACCEPTED
+        if asks_version:
+            result = mavlink.MAV_RESULT_ACCEPTED
         sender = message.get_srcSystem(), message.get_srcComponent()
         self._say(self._codec.command_ack_encode(message.command, result, 0, 0, *sender), now_ns)
-        if stream is None or result != mavlink.MAV_RESULT_ACCEPTED:
+        if asks_version:
+            self._say(self._version(), now_ns)
+        elif stream is None or result != mavlink.MAV_RESULT_ACCEPTED:
             return
-        if message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
+        elif message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
             for answer in stream.build(now_ns):
                 self._say(answer, now_ns)
         elif message.param2 == 0.0:
@@ -367,6 +428,17 @@ class MavlinkAutopilot:
             if cm != UNKNOWN_CM:
                 self._bins[place] = math.inf if cm >= message.max_distance else cm * 0.01
                 self._bin_ns[place] = now_ns
+
+
+def _usual_parameters(kind: Kind, system: int) -> list[Parameter]:
+    if kind == "px4":
+        return [("MAV_SYS_ID", INT32, system), ("SYS_AUTOSTART", INT32, 50000), ("CP_DIST", REAL32, -1.0)]
+    return [
+        ("SYSID_THISMAV", INT32, system),
+        ("FRAME_CLASS", INT32, 1),
+        ("PRX1_TYPE", INT32, 2),
+        ("AVOID_MARGIN", REAL32, 2.0),
+    ]
 
 
 def _bin(clockwise_deg: float) -> int:

@@ -1,9 +1,12 @@
-"""pymavlink's own connections, on which most ground tools stand, on the emulated autopilot."""
+"""Other people's MAVLink on the emulated autopilot: pymavlink's connections, on which most ground tools stand; mavsdk
+(4 or later), which asks for version, parameters and rates as ground stations do."""
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -75,3 +78,39 @@ def test_messages_flow_both_ways(meeting: tuple[MavlinkAutopilot, Any]) -> None:
     assert near.current_distance == 100
     assert pilot.companion_ns is not None
     assert (pilot.accepted, pilot.refused) == (3, 0)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mavsdk") is None, reason="needs mavsdk")
+@pytest.mark.parametrize(("kind", "id_name"), [("px4", "MAV_SYS_ID"), ("ardupilot", "SYSID_THISMAV")])
+def test_mavsdk_meets_its_autopilot(kind: Any, id_name: str) -> None:
+    mavsdk = importlib.import_module("mavsdk")
+    telemetry, info, param = (importlib.import_module(f"mavsdk.plugins.{n}") for n in ("telemetry", "info", "param"))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    pilot = MavlinkAutopilot(Rolling(), kind=kind, system=7, line_rate_bps=None, rangefinders=[Rangefinder(0, Mount())])
+    loop = Attachment()
+    loop.add("pilot", pilot, UdpLink(port))
+    ground = mavsdk.Mavsdk(mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION))
+    try:
+        ground.add_any_connection(f"udpin://127.0.0.1:{port}")
+        with loop:
+            system = ground.first_autopilot(5.0)
+            assert system is not None
+            assert system.get_system_id() == 7
+            heard: dict[str, list[Any]] = {"odometry": [], "distance_sensor": []}
+            asks = telemetry.Telemetry(system)
+            for name, values in heard.items():
+                getattr(asks, f"subscribe_{name}")(lambda value, _=None, values=values: values.append(value))
+                getattr(asks, f"set_rate_{name}")(50.0)
+            for values in heard.values():
+                values.clear()
+            time.sleep(1.0)
+            assert len(heard["odometry"]) == pytest.approx(50, abs=8)
+            assert heard["odometry"][-1].velocity_body.x_m_s == pytest.approx(0.5, abs=0.01)
+            assert heard["distance_sensor"][-1].current_distance_m == pytest.approx(1.0)
+            assert info.Info(system).get_version().flight_sw_major == (1 if kind == "px4" else 4)
+            numbers = {each.name: each.value for each in param.Param(system).get_all_params().int_params}
+            assert numbers[id_name] == 7
+    finally:
+        ground.destroy()

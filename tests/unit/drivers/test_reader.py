@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import random
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from drivers.conversation import SetBaudRate
+from drivers.conversation import SetBaudRate, silence_limit
 from drivers.errors import PortAbsent, PortError
 from drivers.ports import Direction
 from drivers.queues import BoundedQueue
@@ -264,6 +265,39 @@ def test_a_pause_is_told_but_costs_no_reset() -> None:
     assert len(bench.talker.connected_at) == 1
 
 
+def test_late_and_bunched_deliveries_are_no_silence() -> None:
+    """100 readings a second through a hub that holds them back for up to 45 ms: no alarm; their end is seen in time."""
+    bench = Bench()
+    bench.talker.silence_limit_ns = silence_limit(10 * MS)
+    delay = random.Random(5)
+    held_until_ms = 0
+    for ms in range(50, 20_000, 10):
+        if ms >= held_until_ms:
+            held_until_ms = ms + delay.randrange(0, 46)
+        bench.plan.append((held_until_ms * MS, bench.say))
+    bench.run_until(20_000)
+    assert bench.states() == [LinkState.SILENT, LinkState.RUNNING]
+    last_ms = bench.plan[-1][0] // MS if bench.plan else held_until_ms
+    bench.run_until(20_300)
+    told_ms, state, _ = bench.events()[-1]
+    assert state is LinkState.SILENT
+    assert told_ms - last_ms <= 60 + 20
+
+
+def test_a_device_slower_than_it_was_told_to_be_gets_three_of_its_own_periods() -> None:
+    bench = Bench()
+    bench.talker.silence_limit_ns = silence_limit(20 * MS)
+    bench.say_from_to(50, 5_050, 80)
+    bench.run_until(1_000)
+    settled = len(bench.states())
+    bench.run_until(5_000)
+    assert len(bench.states()) == settled, "known after a few readings"
+    bench.run_until(6_000)
+    told_ms, state, _ = bench.events()[settled]
+    assert state is LinkState.SILENT
+    assert told_ms - 5_010 <= 3 * 80 + 20
+
+
 def test_our_own_pause_is_no_silence_of_the_device() -> None:
     """This thread did not run for 2 s, so it did not ask: the device could not answer."""
     bench = Bench()
@@ -281,9 +315,9 @@ def test_our_own_pause_is_no_silence_of_the_device() -> None:
 
 
 def test_a_device_that_comes_and_goes_is_not_restarted_in_a_rush() -> None:
-    """A reading every 800 ms with a limit of 300 ms: restarts wait longer and longer, but never end."""
+    """A reading every 950 ms with a limit of 300 ms: restarts wait longer and longer, but never end."""
     bench = Bench()
-    bench.say_from_to(0, 20_000, 800)
+    bench.say_from_to(0, 20_000, 950)
     bench.run_until(20_000)
     gaps = [b - a for a, b in pairwise(bench.talker.connected_at)]
     assert len(gaps) > 10

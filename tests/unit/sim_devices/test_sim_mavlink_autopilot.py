@@ -191,6 +191,43 @@ def test_message_intervals_follow_commands() -> None:
     assert bench.tell(command(511, 9000, 1000, system=9)) == b""
 
 
+@pytest.mark.parametrize("asked", [(512, 148), (520, 1)])
+def test_version_is_told_when_asked_for(asked: tuple[int, int]) -> None:
+    bench = Bench()
+    answers = read(bench.tell(command(*asked)))
+    assert [message.get_type() for message in answers] == ["COMMAND_ACK", "AUTOPILOT_VERSION"]
+    assert answers[0].result == 0
+    assert answers[1].flight_sw_version >> 24 == 4
+
+
+@pytest.mark.parametrize(("kind", "told"), [("ardupilot", 1.0), ("px4", struct.unpack("<f", struct.pack("<i", 1))[0])])
+def test_parameters_are_listed_read_and_set(kind: Kind, told: float) -> None:
+    """Whole numbers as floats of their value, or of their bits: where the two disagree, ids come out as 1e-45."""
+    bench = Bench(kind=kind)
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=196)
+    listed = of(bench.tell(bytes(sender.param_request_list_encode(1, 1).pack(sender))), "PARAM_VALUE")
+    assert [value.param_index for value in listed] == list(range(listed[0].param_count))
+    assert listed[0].param_value == told
+    last = listed[-1]
+    name = last.param_id.encode()
+    one = bytes(sender.param_request_read_encode(1, 1, name, -1).pack(sender))
+    assert of(bench.tell(one), "PARAM_VALUE")[0].param_value == last.param_value
+    set_it = bytes(sender.param_set_encode(1, 1, name, 3.5, last.param_type).pack(sender))
+    assert of(bench.tell(set_it), "PARAM_VALUE")[0].param_value == 3.5
+    assert of(bench.tell(one), "PARAM_VALUE")[0].param_value == 3.5
+    assert bench.tell(bytes(sender.param_request_read_encode(1, 1, b"NO_SUCH", -1).pack(sender))) == b""
+    assert bench.tell(bytes(sender.param_request_list_encode(9, 1).pack(sender))) == b""
+
+
+def test_ping_and_an_empty_mission_are_answered() -> None:
+    bench = Bench()
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=196)
+    (answer,) = of(bench.tell(bytes(sender.ping_encode(77, 5, 0, 0).pack(sender))), "PING")
+    assert (answer.time_usec, answer.seq, answer.target_component) == (77, 5, 196)
+    (answer,) = of(bench.tell(bytes(sender.mission_request_list_encode(1, 1).pack(sender))), "MISSION_COUNT")
+    assert (answer.count, answer.target_component) == (0, 196)
+
+
 def test_timesync_is_answered() -> None:
     bench = Bench()
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=196)
