@@ -39,6 +39,7 @@ POLL_MS = 20  # readers look at silence so often
 # ---- devices --------------------------------------------------------------------------------------------------------
 
 CAN: Table = {"main": {"interface": "slcan", "channel": "main", "bitrate_bps": 1000000}}
+SWITCH_LINE = 2
 YAWS = {1: -40.0, 2: 0.0, 3: 40.0}
 
 
@@ -79,12 +80,13 @@ def with_wheels(driver: str, ticks_per_turn: float = 4096.0, **more: object) -> 
     return robot("front", drive=drive, **buses, lasers=lasers, wheels={"drive": {"driver": driver, **more}})
 
 
-def with_contacts() -> Table:
+def with_contacts(driver: str, **more: object) -> Table:
     """A bumper in front, and an LD06 that sees over it."""
-    switch = {"line": 4, "x_m": 0.16, "width_m": 0.24}
-    bumpers = {"bumpers": {"driver": "arduino-bridge", "port": "/dev/ttyUSB0", "switches": [switch]}}
+    switch = {"line": SWITCH_LINE, "x_m": 0.16, "width_m": 0.24}
+    bumpers = {"bumpers": {"driver": driver, **more, "switches": [switch]}}
+    buses = {"can": {"main": dict(CAN["main"])}} if "can" in more else {}
     lasers = {"front": {"driver": "ldrobot", "port": "/dev/ttyUSB9"}}
-    return robot("front", "bumpers", lasers=lasers, contacts=bumpers)
+    return robot("front", "bumpers", **buses, lasers=lasers, contacts=bumpers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +137,10 @@ DEVICES: dict[str, Device] = {
     "ros_arduino_bridge, wheels": Device(
         lambda: with_wheels("arduino-bridge", port="/dev/ttyUSB0"), "drive", "encoder"
     ),
-    "ros_arduino_bridge, contacts": Device(with_contacts, "bumpers", "contact.bumpers"),
+    "ros_arduino_bridge, contacts": Device(
+        lambda: with_contacts("arduino-bridge", port="/dev/ttyUSB0"), "bumpers", "contact.bumpers"
+    ),
+    "USBoard, contacts": Device(lambda: with_contacts("usboard", can="main"), "bumpers", "contact.bumpers", "can"),
     "RoboClaw": Device(lambda: with_wheels("roboclaw", port="/dev/ttyACM0"), "drive", "encoder"),
     "CiA 406 encoders": Device(lambda: with_wheels("cia406", can="main"), "drive", "encoder.left", "can"),
     "ODrive 0.5": Device(
@@ -203,7 +208,7 @@ BUS = [
 ]
 LASER = [Trouble((kind,), "blind") for kind in ("lost_sector", "sun=1", "black", "glass=1")]
 
-SWITCH = [Trouble((kind,), "blocked", target="contact.bumpers.4") for kind in ("stuck_on",)]
+SWITCH = [Trouble((kind,), "blocked", target=f"contact.bumpers.{SWITCH_LINE}") for kind in ("stuck_on",)]
 
 
 def troubles_of(device: Device) -> list[Trouble]:
@@ -320,11 +325,16 @@ class Bench:
     def _period_ms(self, since_ns: int) -> float:
         """Between readings; of a chain, from one reading of a transducer to its next."""
         readings = self.rig.readings(self.device.source, since_ns)
-        count = len(readings)
         if readings and isinstance(readings[0], ChainReading):
             first = readings[0].ranges[0].channel
-            count = sum(heard.channel == first for each in readings for heard in each.ranges)
-        return BASELINE_S * 1e3 / max(count, 1)
+            readings = [
+                each
+                for each in readings
+                if isinstance(each, ChainReading) and any(heard.channel == first for heard in each.ranges)
+            ]
+        if len(readings) < 2:
+            return BASELINE_S * 1e3
+        return float(np.median(np.diff([each.stamp_ns for each in readings]))) / 1e6  # a burst after a pause is none
 
     def _note_loss(self, row: Row, before: _Reach, begun_ns: int) -> None:
         rig = self.rig

@@ -35,6 +35,7 @@ _FIRST_BACKOFF_NS = 100_000_000
 _LONGEST_BACKOFF_NS = 1_000_000_000
 _SILENCE_PATIENCE_NS = 400_000_000  # a device that only paused keeps its set-up, and wheels their count
 _SHORTEST_BEFORE_RESET_NS = 600_000_000
+_MUCH_LONGER = 1.5  # less is the jitter of its deliveries
 _INTERVALS_KEPT = 9  # the middle one of so many is a source's usual period
 _OWN_PAUSE_NS = 30_000_000  # so much later than it should be, the loop itself was held up
 _SETUP_LIMIT_NS = 20_000_000_000  # spin-up and the search for a line speed included
@@ -445,9 +446,10 @@ class _Source(Generic[WireT]):
             self._restart(now_ns)
 
     def _silence_limit_ns(self) -> int:
-        """What the conversation says, or three of the periods that were measured where the device takes longer."""
+        """What the conversation says, or three of the periods that were measured where the device takes much longer."""
         told_ns = self._conversation.silence_limit_ns
-        return max(told_ns, min(3 * self._usual.period_ns, MOST_SILENCE_NS))
+        found_ns = min(3 * self._usual.period_ns, MOST_SILENCE_NS)
+        return found_ns if found_ns > _MUCH_LONGER * told_ns else told_ns
 
     def _restart_when_due(self, now_ns: int) -> None:
         """Silence: start anew, but no more often than the back-off allows: a device may come and go."""

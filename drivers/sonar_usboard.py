@@ -1,7 +1,10 @@
 """Neobotix USBoard and USBoard-USS5 ultrasonic chains, on CAN or on a serial line: the conversation.
 
+The four analog inputs may be switches (bumpers, cliff sensors): a line near 0 V is low, one near 5 V high, one between
+is not believed.
+
     CONNECT each 0.25 s until anything comes -> READ_PARASET (identity, what is active, how often it sends)
-    -> GET_DATA at the wanted rate, or listening to what the board sends by itself
+    -> GET_DATA at the wanted rate, or listening to what the board sends by itself; GET_ANALOGIN for switches
 
 The messages stand in usboard_messages.py. Old boards (hardware version 0) know GET_DATA_1TO8 and GET_DATA_9TO16 only.
 """
@@ -9,8 +12,9 @@ The messages stand in usboard_messages.py. Old boards (hardware version 0) know 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Literal
 
 from drivers.conversation import CanFrame, SetBaudRate, silence_limit
@@ -18,6 +22,9 @@ from drivers.errors import FrameError
 from drivers.readings import (
     ChainReading,
     ClockFit,
+    ContactLine,
+    ContactReading,
+    ContactState,
     Identity,
     LinkState,
     RangeReading,
@@ -62,6 +69,9 @@ _LEGACY_AFTER = 3  # GET_DATA unanswered so often: perhaps an old board
 _MISSED_ROUNDS = 2  # so often the others answered without this group
 _DEFAULT_FIRE_NS = 20_000_000
 _NEVER = 1 << 62
+INPUTS = (0, 1, 2, 3)
+_NONE: Mapping[int, bool] = MappingProxyType({})
+_LOW_V, _HIGH_V = 1.5, 3.5  # the levels of 5 V logic
 
 
 @dataclass(slots=True)
@@ -84,6 +94,7 @@ class _Progress:
     parameters_due_ns: int = 0
     request_due_ns: int = 0
     analog_due_ns: int = 0
+    analog_heard: bool = False
     group_seen_ns: dict[int, int] = field(default_factory=dict)
     frames_since: dict[int, int] = field(default_factory=dict)  # of other groups, since this one was heard
     silent_groups: set[int] = field(default_factory=set)
@@ -101,6 +112,8 @@ class _Board:
         mode: Mode,
         range_max_m: float,
         analog_rate_hz: float,
+        switches: Mapping[int, bool],
+        measures: bool,
         sends_itself: tuple[SendMode, ...],
         wire_time_ns: int,
         slowest_period_ns: int,
@@ -111,8 +124,12 @@ class _Board:
             raise ValueError(f"channels {channels}: a USBoard has channels 1 to 16")
         if rate_hz is not None and not 0.0 < rate_hz <= 100.0:
             raise ValueError(f"rate_hz {rate_hz}: above 0, up to 100, or None for as fast as it fires")
+        if not set(switches) <= set(INPUTS):
+            raise ValueError(f"inputs {sorted(switches)}: a USBoard has inputs 0 to 3")
         self._all_wanted = channels is None
-        self._groups = sorted({(channel - 1) // 4 for channel in self.channels})
+        self._measures = measures
+        self._groups = sorted({(channel - 1) // 4 for channel in self.channels}) if measures else []
+        self._active_low = dict(switches)
         self._rate_hz = rate_hz
         self._mode = mode
         self._range_max_m = range_max_m
@@ -122,7 +139,7 @@ class _Board:
         self._slowest_period_ns = slowest_period_ns
         self._silent_hint = silent_hint
         self._now = _Progress()
-        self._last_stamp_ns = -(1 << 62)
+        self._last_stamp_ns = self._last_contact_ns = -(1 << 62)
         self.counters = SourceCounters()
         self.identity: Identity | None = None
         self.analog_v: tuple[float, ...] | None = None
@@ -159,6 +176,19 @@ class _Board:
         period_ns = self._period_ns()
         limit_ns = silence_limit(period_ns)
         return max(limit_ns, period_ns * 3 // 2)  # only when told to listen to a board that speaks less often
+
+    @property
+    def contact_limit_ns(self) -> int:
+        """The same for the switches."""
+        return silence_limit(self._analog_period_ns)
+
+    @property
+    def contact_trouble(self) -> str | None:
+        """What is wrong with the switches."""
+        now = self._now
+        if not self._active_low or now.parameters is None or now.parameters.analog_inputs or now.analog_heard:
+            return None
+        return "the board does not tell its inputs: switch the analog inputs on in its parameters (byte 5, bit 2)"
 
     def connected(self, now_ns: int) -> None:
         self._now = _Progress(connected_ns=now_ns, connect_due_ns=now_ns)
@@ -207,7 +237,7 @@ class _Board:
     def _watch_sending(self, now_ns: int) -> None:
         """The parameters say that the board sends by itself, but nothing comes: do not believe them."""
         now = self._now
-        if now.parameters is None or now.running:
+        if now.parameters is None or now.running or not self._measures:
             return
         now.measuring_since_ns = now.measuring_since_ns or now_ns
         if now_ns - now.measuring_since_ns > _LISTEN_PATIENCE_NS:
@@ -240,6 +270,8 @@ class _Board:
 
     def _asks(self) -> bool:
         """Whether data must be asked for."""
+        if not self._measures:
+            return False
         now = self._now
         if self._mode != "auto":
             return self._mode == "request"
@@ -257,7 +289,7 @@ class _Board:
 
     # ---- in
 
-    def take(self, message: bytes, stamp_ns: int) -> Iterator[ChainReading]:
+    def take(self, message: bytes, stamp_ns: int) -> Iterator[Reading]:
         """One whole message that arrived at stamp_ns."""
         try:
             readings = self._understand(message, stamp_ns)
@@ -273,7 +305,7 @@ class _Board:
             self.counters.readings += 1
             yield reading
 
-    def _understand(self, message: bytes, stamp_ns: int) -> list[ChainReading]:
+    def _understand(self, message: bytes, stamp_ns: int) -> Sequence[Reading]:
         command = message[0]
         if command == Command.GET_DATA:
             return self._readings(decode_group(message), stamp_ns)
@@ -284,7 +316,25 @@ class _Board:
             self._take_parameters(message)
         elif command == Command.GET_ANALOGIN:
             self.analog_v = decode_analog(message)
+            self._now.analog_heard = True
+            return self._contacts(self.analog_v, stamp_ns)
         return []
+
+    def _contacts(self, inputs_v: tuple[float, ...], stamp_ns: int) -> list[ContactReading]:
+        """What the switches at the inputs say; a line between the levels is torn or shorted, and says nothing."""
+        if not self._active_low:
+            return []
+        lines = []
+        for line, trips_low in sorted(self._active_low.items()):
+            state = ContactState.UNKNOWN
+            if inputs_v[line] <= _LOW_V or inputs_v[line] >= _HIGH_V:
+                is_low = inputs_v[line] <= _LOW_V
+                state = ContactState.TRIPPED if is_low is trips_low else ContactState.CLEAR
+            else:
+                self.counters.drop("between_levels")
+            lines.append(ContactLine(line, state))
+        self._last_contact_ns = max(stamp_ns - self._wire_time_ns, self._last_contact_ns + 1)
+        return [ContactReading(self._last_contact_ns, tuple(lines))]
 
     def _take_parameters(self, message: bytes) -> None:
         now = self._now
@@ -300,6 +350,8 @@ class _Board:
 
     def _readings(self, group: GroupValues, stamp_ns: int) -> list[ChainReading]:
         index = (group.first_channel - 1) // 4
+        if not self._measures:
+            return []  # somebody else's question, or the board's habit
         if index not in self._groups:
             self.counters.drop("unwanted_group")
             return []
@@ -450,6 +502,14 @@ class _UsBoardLink:
     def silence_limit_ns(self) -> int:
         return self._board.silence_limit_ns
 
+    def silence_limit_of(self, kind: type[Reading]) -> int:
+        """See drivers.shares.ManySources."""
+        return self._board.contact_limit_ns if kind is ContactReading else self._board.silence_limit_ns
+
+    def trouble_of(self, kind: type[Reading]) -> str | None:
+        """See drivers.shares.ManySources."""
+        return self._board.contact_trouble if kind is ContactReading else self._board.trouble
+
     @property
     def analog_v(self) -> tuple[float, ...] | None:
         """The four analog inputs in volts, if they are asked for and were answered."""
@@ -464,7 +524,9 @@ class UsBoardConversation(_UsBoardLink):
     """A USBoard on CAN. Several boards share a bus by their base ids (400h, 420h, …).
 
     channels: those in use, 1..16 (None: all).  rate_hz: of the values; None: as fast as the transducers fire.
-    range_max_m: a value beyond what the transducers can measure is INVALID.  analog_rate_hz: 0 does not ask.
+    range_max_m: a value beyond what the transducers can measure is INVALID.  analog_rate_hz: of the four inputs, 0 does
+    not ask.  switches: those inputs (0..3) that are switches, and whether low means tripped.  measures: False where
+    only the switches are of interest.
     """
 
     def __init__(
@@ -477,6 +539,8 @@ class UsBoardConversation(_UsBoardLink):
         mode: Mode = "auto",
         range_max_m: float = 6.0,
         analog_rate_hz: float = 0.0,
+        switches: Mapping[int, bool] = _NONE,
+        measures: bool = True,
     ) -> None:
         super().__init__(
             _Board(
@@ -485,6 +549,8 @@ class UsBoardConversation(_UsBoardLink):
                 mode=mode,
                 range_max_m=range_max_m,
                 analog_rate_hz=analog_rate_hz,
+                switches=switches,
+                measures=measures,
                 sends_itself=(SendMode.ON_CAN, SendMode.ON_BOTH),
                 wire_time_ns=0,  # a frame takes 0.13 ms at 1 Mbit/s
                 slowest_period_ns=0,
@@ -540,6 +606,8 @@ class UsBoardSerialConversation(_UsBoardLink):
         mode: Mode = "auto",
         range_max_m: float = 6.0,
         analog_rate_hz: float = 0.0,
+        switches: Mapping[int, bool] = _NONE,
+        measures: bool = True,
     ) -> None:
         super().__init__(
             _Board(
@@ -548,6 +616,8 @@ class UsBoardSerialConversation(_UsBoardLink):
                 mode=mode,
                 range_max_m=range_max_m,
                 analog_rate_hz=analog_rate_hz,
+                switches=switches,
+                measures=measures,
                 sends_itself=(SendMode.ON_SERIAL, SendMode.ON_BOTH),
                 wire_time_ns=SERIAL_SIZE * 10 * 1_000_000_000 // _SERIAL_BAUD,
                 slowest_period_ns=50_000_000,

@@ -53,6 +53,8 @@ from service.config_devices import (
     RplidarLaser,
     SickColaLaser,
     SickLms2xxLaser,
+    UsBoardContacts,
+    UsBoardSerialContacts,
     UsBoardSerialSonars,
     UsBoardSonars,
     VescWheels,
@@ -76,6 +78,7 @@ from service.sensors import (
 if TYPE_CHECKING:
     from drivers.encoder_arduino_bridge import ArduinoBridgeConversation
     from drivers.mavlink_in import MavlinkConversation
+    from drivers.sonar_usboard import UsBoardConversation, UsBoardSerialConversation
     from mapping.planes.extract import PlaneRules
     from service.background import Submit
     from service.elevation_maker import ElevationMaker
@@ -152,7 +155,8 @@ def _serial_wires(config: Config) -> Iterator[Wire]:
 
 def _talks(devices: Mapping[str, Device]) -> Mapping[str, Callable[[], Conversation[Any]]]:
     """Makers of the conversations on one serial port; of a board that is several sources they share the board."""
-    if not any(getattr(device, "driver", None) in SHARED_DRIVERS for device in devices.values()):
+    is_one = len(devices) == 1 or not any(getattr(each, "driver", None) in SHARED_DRIVERS for each in devices.values())
+    if is_one:
         return {source: partial(conversation_of, device) for source, device in devices.items()}
     made: dict[str, Conversation[Any]] = {}
 
@@ -171,6 +175,8 @@ def _shares_of(devices: Mapping[str, Device]) -> dict[str, Conversation[Any]]:
     kinds: dict[str, type[Reading]] = {source: _reading_of(device) for source, device in devices.items()}
     if any(isinstance(device, MavlinkWheels | MavlinkSonars | MavlinkPose) for device in devices.values()):
         return share_out(_mavlink(list(devices.values())), kinds)
+    if any(isinstance(device, _USBOARD) for device in devices.values()):
+        return share_out(_usboard(list(devices.values())), kinds)
     return share_out(_arduino_board(list(devices.values())), kinds)
 
 
@@ -179,7 +185,7 @@ def _reading_of(device: Device) -> type[Reading]:
     match device:
         case ArduinoWheels() | MavlinkWheels():
             return WheelReading
-        case ArduinoContacts():
+        case ArduinoContacts() | UsBoardContacts() | UsBoardSerialContacts():
             return ContactReading
         case MavlinkPose():
             return PoseReading
@@ -233,12 +239,44 @@ def _mavlink(devices: Sequence[Device]) -> MavlinkConversation:
     return MavlinkConversation(kinds, **settings)
 
 
+_USBOARD = (UsBoardSonars, UsBoardSerialSonars, UsBoardContacts, UsBoardSerialContacts)
+
+
+def _usboard(devices: Sequence[Device]) -> UsBoardConversation | UsBoardSerialConversation:
+    """One board, as sonars, as switches, or as both."""
+    from drivers.sonar_usboard import UsBoardConversation, UsBoardSerialConversation
+
+    settings: dict[str, Any] = {"measures": False}
+    for device in devices:
+        if isinstance(device, UsBoardSonars | UsBoardSerialSonars):
+            settings |= {
+                "measures": True,
+                "channels": _channels(device),
+                "rate_hz": device.rate_hz,
+                "mode": device.sending,
+            }
+        elif isinstance(device, UsBoardContacts | UsBoardSerialContacts):
+            settings |= {
+                "switches": {switch.line: switch.tripped == "low" for switch in device.switches},
+                "analog_rate_hz": device.rate_hz,
+            }
+    on_can = [device for device in devices if isinstance(device, UsBoardSonars | UsBoardContacts)]
+    return UsBoardConversation(on_can[0].base_id, **settings) if on_can else UsBoardSerialConversation(**settings)
+
+
 def _can_wires(config: Config) -> Iterator[Wire]:
     members: dict[str, dict[str, Callable[[], Conversation[Any]]]] = {}
+    boards: dict[tuple[str, int], dict[str, Device]] = {}
     for section, name, device in config.devices():
         bus = device.can_bus()
-        if bus is not None:
-            members.setdefault(bus, {})[config.source_name(section, name)] = partial(conversation_of, device)
+        if bus is None:
+            continue
+        source = config.source_name(section, name)
+        members.setdefault(bus, {})[source] = partial(conversation_of, device)
+        if isinstance(device, UsBoardSonars | UsBoardContacts):
+            boards.setdefault((bus, device.base_id), {})[source] = device
+    for (bus, _), devices in boards.items():
+        members[bus] |= _talks(devices)
     for bus, conversations in members.items():
         can = config.can[bus]
         port = can.channel if can.interface == "slcan" else None
@@ -246,7 +284,7 @@ def _can_wires(config: Config) -> Iterator[Wire]:
 
 
 _UDP = ("udpin:", "udpout:")
-_FIRST_BAUD: dict[type[Device], int] = {UsBoardSerialSonars: 19200}
+_FIRST_BAUD: dict[type[Device], int] = {UsBoardSerialSonars: 19200, UsBoardSerialContacts: 19200}
 
 
 def _stops_by_dtr(device: Device) -> bool:
@@ -352,16 +390,8 @@ def conversation_of(device: Device) -> Conversation[Any]:
                 no_echo=device.no_echo,
                 start=device.start,
             )
-        case UsBoardSonars():
-            from drivers.sonar_usboard import UsBoardConversation
-
-            return UsBoardConversation(
-                device.base_id, channels=_channels(device), rate_hz=device.rate_hz, mode=device.sending
-            )
-        case UsBoardSerialSonars():
-            from drivers.sonar_usboard import UsBoardSerialConversation
-
-            return UsBoardSerialConversation(channels=_channels(device), rate_hz=device.rate_hz, mode=device.sending)
+        case UsBoardSonars() | UsBoardSerialSonars():
+            return _usboard([device])
         case Cia406Wheels():
             from drivers.encoder_cia406 import Cia406PairConversation
 
@@ -416,6 +446,8 @@ def conversation_of(device: Device) -> Conversation[Any]:
             return AliceConversation(baud=device.baud_bps)
         case ArduinoWheels() | ArduinoSonars() | ArduinoContacts() | MavlinkWheels() | MavlinkSonars() | MavlinkPose():
             return _shares_of({"": device})[""]
+        case UsBoardContacts() | UsBoardSerialContacts():
+            return _shares_of({"": device})[""]
         case _:
             raise TypeError(f"no driver for {type(device).__name__}")
 
@@ -469,7 +501,7 @@ def _sensor_of(source: str, device: Device) -> Sensor:
             return Wheels(source)
         case Cia406Mount():
             return AxleEncoder(source)
-        case ArduinoContacts():
+        case ArduinoContacts() | UsBoardContacts() | UsBoardSerialContacts():
             switches = tuple(
                 Switch(each.line, Pose2(each.x_m, each.y_m, math.radians(each.yaw_deg)), each.width_m)
                 for each in device.switches

@@ -20,9 +20,9 @@ from service.config_base import Name, Section
 from service.config_devices import (
     SHARED_DRIVERS,
     AliceRing,
-    ArduinoContacts,
     CanBus,
     Cia406Mount,
+    ContactDevice,
     Device,
     Drive,
     LaserDevice,
@@ -63,7 +63,7 @@ class Config(Section):
     can: dict[Name, CanBus] = Field(default={}, description="CAN buses by name.")
     lasers: dict[Name, LaserDevice] = Field(default={}, description="Laser rangefinders by name.")
     sonars: dict[Name, SonarDevice] = Field(default={}, description="Ultrasonic chains by name.")
-    contacts: dict[Name, ArduinoContacts] = Field(default={}, description="Bumpers and cliff switches by name.")
+    contacts: dict[Name, ContactDevice] = Field(default={}, description="Bumpers and cliff switches by name.")
     wheels: dict[Name, WheelDevice] = Field(default={}, description="Wheel encoders by name.")
     mounts: dict[Name, Cia406Mount] = Field(default={}, description="Mounts that nod or turn a laser, by name.")
     poses: dict[Name, MavlinkPose] = Field(default={}, description="Other estimators of the robot's pose by name.")
@@ -332,10 +332,18 @@ def _port_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
 
 def _can_id_faults(config: Config) -> Iterator[Fault]:
     taken: dict[tuple[str, int], str] = {}
+    boards: dict[tuple[str, int], set[str]] = {}  # a USBoard's sonars and its switches have the ids in common
     for section, name, device in config.devices():
         bus = device.can_bus()
         if bus is None:
             continue
+        base_id = getattr(device, "base_id", None)
+        if base_id is not None:
+            sections = boards.setdefault((bus, base_id), set())
+            is_same_board = bool(sections) and section not in sections
+            sections.add(section)
+            if is_same_board:
+                continue
         clashes = sorted(can_id for can_id in device.can_ids() if (bus, can_id) in taken)
         if clashes:
             other = taken[bus, clashes[0]]

@@ -12,7 +12,7 @@ from service.config_base import Name, Point, Positive, Section
 
 SERIAL_NUMBER = "serial:"
 """What a port begins with that is a device's serial number: where it is plugged in is found out when it is opened."""
-SHARED_DRIVERS = ("arduino-bridge", "mavlink")
+SHARED_DRIVERS = ("arduino-bridge", "mavlink", "usboard", "usboard-serial")
 """Of boards that are several sources: a table in each section may name the same port."""
 
 
@@ -626,12 +626,9 @@ class Switch(Section):
     width_m: float = Field(default=0.2, gt=0, le=10, description="How wide it is.")
 
 
-class ArduinoContacts(Device):
-    """Bumpers and cliff switches at digital pins of a board with the text protocol of ros_arduino_bridge."""
+class _Contacts(Device):
+    """Switches of whatever device."""
 
-    driver: Literal["arduino-bridge"] = Field(description="Says that it is this kind of device.")
-    port: str = Field(min_length=1, description=_BRIDGE_PORT)
-    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed as set in the sketch.")
     rate_hz: float = Field(default=20.0, gt=0, le=50, description="How often each switch is asked.")
     hold_s: float = Field(
         default=0.5, ge=0, le=60, description="How long it counts as touched after it was: contacts bounce."
@@ -639,11 +636,55 @@ class ArduinoContacts(Device):
     switches: tuple[Switch, ...] = Field(min_length=1, max_length=32, description="The connected ones.")
 
     @model_validator(mode="after")
-    def _lines_of_their_own(self) -> ArduinoContacts:
+    def _lines_of_their_own(self) -> _Contacts:
         lines = [switch.line for switch in self.switches]
         if len(set(lines)) != len(lines):
-            raise ValueError("two switches have the same line; each has a pin of its own")
+            raise ValueError("two switches have the same line; each has a line of its own")
         return self
+
+
+class ArduinoContacts(_Contacts):
+    """Bumpers and cliff switches at digital pins of a board with the text protocol of ros_arduino_bridge."""
+
+    driver: Literal["arduino-bridge"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description=_BRIDGE_PORT)
+    baud_bps: int = Field(default=57600, ge=1200, le=4000000, description="Line speed as set in the sketch.")
+
+
+class _UsBoardContacts(_Contacts):
+    """Switches at the analog inputs of a USBoard, whatever its link."""
+
+    @model_validator(mode="after")
+    def _inputs_there(self) -> _UsBoardContacts:
+        for switch in self.switches:
+            if switch.line > 3:
+                raise ValueError(f"a USBoard has inputs 0 to 3, not {switch.line}")
+        return self
+
+
+class UsBoardContacts(_UsBoardContacts):
+    """Bumpers and cliff switches at the four analog inputs of a USBoard on CAN."""
+
+    driver: Literal["usboard"] = Field(description="Says that it is this kind of device.")
+    can: Name = Field(description="The [can.NAME] it is on.")
+    base_id: int = Field(default=0x400, ge=0, le=0x7EF, description="First of its CAN ids; that of its sonars.")
+
+    def can_ids(self) -> frozenset[int]:
+        """Those of the board: see UsBoardSonars."""
+        return frozenset(range(self.base_id, self.base_id + 0x11))
+
+
+class UsBoardSerialContacts(_UsBoardContacts):
+    """The same at a board on its RS-232 or USB line."""
+
+    driver: Literal["usboard-serial"] = Field(description="Says that it is this kind of device.")
+    port: str = Field(min_length=1, description="Its serial port; the same as that of its sonars.")
+
+
+ContactDevice = Annotated[
+    ArduinoContacts | UsBoardContacts | UsBoardSerialContacts,
+    Field(discriminator="driver", description="Bumpers and cliff switches."),
+]
 
 
 class AliceRing(Device):

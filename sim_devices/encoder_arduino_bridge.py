@@ -27,6 +27,7 @@ from math import isfinite, radians
 import numpy as np
 
 from sim_devices.device import Mount, Scene
+from sim_devices.sonar_faults import SONAR_KINDS, SonarTroubles
 from sim_devices.wheel import Undo, Wheel, inflict_on_counts, signed
 from sim_devices.wire import SECOND_NS, PacedWire
 
@@ -88,6 +89,8 @@ class ArduinoBridge:
         self.pins = dict(pins or {})
         self.analog = dict(analog or {})
         self.pid = (20, 12, 0, 50)
+        self.sonar_troubles = SonarTroubles()
+        self.fault_families = (*(("encoder",) if self.wheels else ()), *(("sonar",) if self.sonars else ()))
         self._scene: Scene | None = self.wheels[0].scene if self.wheels else None
         self._boot_ns = round(boot_s * SECOND_NS)
         self._noise_m = noise_m
@@ -137,6 +140,8 @@ class ArduinoBridge:
 
     def inflict(self, kind: str, value: float, arguments: Mapping[str, float], now_ns: int) -> Undo | None:
         """See wheel.Faulty."""
+        if kind in SONAR_KINDS:
+            return self.sonar_troubles.inflict(kind, value, arguments)
         if kind == "reset":
             self.power_on(now_ns)
         else:
@@ -246,7 +251,16 @@ class ArduinoBridge:
         sonar = self.sonars.get(pin)
         if sonar is None or self._scene is None:
             return b"0", NOTHING_CONNECTED_NS
-        range_m = self._scene.cone_range(sonar.mount, sonar.half_angle_rad, now_ns, sonar.range_max_m)
+        scene = self._scene
+
+        def measure(at_pin: int) -> float:
+            there = self.sonars.get(at_pin, sonar)
+            return scene.cone_range(there.mount, there.half_angle_rad, now_ns, sonar.range_max_m)
+
+        told_m = self.sonar_troubles.told_m(pin, measure, self._random, sonar.range_max_m)
+        if told_m is None:
+            return b"0", NOTHING_CONNECTED_NS
+        range_m = told_m
         if not (isfinite(range_m) and range_m <= sonar.range_max_m):
             return b"0", NO_ECHO_NS
         range_m = max(sonar.range_min_m, range_m + self._noise_m * float(self._random.standard_normal()))

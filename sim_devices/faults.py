@@ -111,7 +111,7 @@ KINDS: dict[str, Kind] = {
     "chain_break": Kind("sonar", "all transducers from this channel on are cut off", 1),
     "order_swap": Kind("sonar", "`channel` and `with` are plugged in crosswise"),
     "temperature": Kind("sonar", "the air has this many degrees Celsius", -10.0),
-    "cross_talk": Kind("sonar", "hears the pulses of the other boards in the plan"),
+    "cross_talk": Kind("sonar", "hears others' pulses: of USBoards those in the plan, else 3 of 10 readings"),
     # what encoders meet
     "wrap": Kind("encoder", "the count jumps to this many steps before it wraps (negative: after)", 100),
     "reset": Kind("encoder", "the node restarts with its count at 0"),
@@ -527,7 +527,7 @@ SWING_STEP_NS = 100_000_000  # between two speeds of a head whose speed swings
 
 def _families(device: object) -> list[str]:
     """Which of the kinds' families a device belongs to."""
-    found = [device.fault_family] if isinstance(device, Faulty) else []
+    found = list(getattr(device, "fault_families", (device.fault_family,))) if isinstance(device, Faulty) else []
     if hasattr(device, "set_speed_share"):
         found.append("laser")
     if isinstance(device, UsBoardCan | UsBoardSerial):

@@ -17,6 +17,7 @@ What this emulator does that a naive one would not:
   scan that is complete while the line is still busy is skipped. Counters count all scans, sent or not.
 - Scans have the channels, the range of angles and the rate that were configured; a device in trouble says so in the
   status words of every scan, and has no distances.
+- Its 48 monitoring fields are empty and its digital lines rest, so their events never come.
 - Not yet up to speed: device state busy, no scans. A host that goes away ends its events and its user level.
 - Assumed: the time since start-up in a scan is that of its first beam; distances of 0 mean no echo, 1 blinded, 2 too
   close; real units take only the dialect they are set to.
@@ -25,6 +26,7 @@ What this emulator does that a naive one would not:
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -50,9 +52,14 @@ WRITE_DENIED, UNKNOWN_COMMAND, UNKNOWN_EVENT = 0x0A, 0x0C, 0x0F
 NO_ECHO, BLINDED, TOO_CLOSE = 0, 1, 2
 BUSY, READY, FAULTY = 0, 1, 2
 SCAN_CONFIG = "B" * 11 + "H"
+INPUTS, OUTPUTS = 4, 3  # digital lines
+FIELDS = 48
+_FIELD = re.compile(r"field(\d{3})")
+QUIET_EVENTS = frozenset(("LFErec", "LIDinputstate", "LIDoutputstate"))  # told when something changes: never here
 SIMPLE_VARIABLES = frozenset(
     (
-        "EIHstCola", "EIIpAddr", "FREchoFilter", "LFPmeanfilter", "LFPmedianfilter", "LFPparticle", "LICencres",
+        "ActiveFieldSet", "EIHstCola", "EIIpAddr", "FieldSetSelectionMethod", "GlareDetectionSens",
+        "FREchoFilter", "LFPmeanfilter", "LFPmedianfilter", "LFPparticle", "LICencres",
         "LICencset", "LICsrc", "SetActiveApplications", "TSCRole", "TSCTCInterface", "TSCTCSrvAddr", "TSCTCupdatetime",
     )
 )  # fmt: skip
@@ -212,6 +219,7 @@ class SickColaLaser:
             "Run": self._run,
             "LMCstartmeas": self._start_measuring,
             "LMCstopmeas": self._stop_measuring,
+            "LMCstandby": self._stop_measuring,
             "mLMPsetscancfg": self._set_scan_config,
             "mEEwriteall": self._write_all,
             "mSCreboot": self._reboot,
@@ -367,6 +375,8 @@ class SickColaLaser:
 
     def _variable(self, name: str, now_ns: int) -> list[Field] | None:
         told = self.profile
+        if (field := _FIELD.fullmatch(name)) is not None and int(field[1]) < FIELDS:
+            return _empty_field(int(field[1]))
         hours = (now_ns - self._boot_ns) // (SECOND_NS * 360)  # tenths of an hour
         start, stop = self._range
         known: dict[str, list[Field]] = {
@@ -382,6 +392,11 @@ class SickColaLaser:
             "ODoprh": [("I", 1234 + hours)],
             "ODpwrc": [("I", self._starts)],
             "LMPscancfg": self._scan_config(),
+            "LIDinputstate": [("H", 0), ("I", 0), *[("B", 0)] * INPUTS, ("H", 0)],
+            "LIDoutputstate": [("H", 0), ("I", 0), *[("B", 0), ("I", 0)] * OUTPUTS, ("H", 0)],
+            "LFErec": [("H", 0)],
+            "FieldSetSelectionMethod": [("B", 0)],
+            "ActiveFieldSet": [("H", 1)],
             "LMPoutputRange": [("H", 1), ("I", self._step), ("i", start), ("i", stop)],
             "LMDscandatacfg": [(kind, int(value)) for kind, value in zip(SCAN_CONFIG, self._config)],
         }
@@ -498,7 +513,9 @@ class SickColaLaser:
 
     def _subscribe(self, request: _Request, now_ns: int) -> None:
         numbers = request.numbers("B")
-        if request.name != "LMDscandata":
+        if request.name in QUIET_EVENTS and numbers is not None and numbers[0] <= 1:
+            self._answer(request, "sEA", [("B", numbers[0])], now_ns)
+        elif request.name != "LMDscandata":
             self._refuse(request, UNKNOWN_EVENT, now_ns)
         elif numbers is None or numbers[0] > 1:
             self._refuse(request, INVALID_DATA, now_ns)
@@ -619,6 +636,12 @@ class SickColaLaser:
             distances[:] = NO_ECHO
         strength = np.rint(16_000.0 / (1.0 + (metres / 6.0) ** 2)).astype(np.int64)
         return distances, np.where(distances > TOO_CLOSE, strength, 0)
+
+
+def _empty_field(number: int) -> list[Field]:
+    """A monitoring field that nobody drew: scales of distances and angles, type, number, no shape of either kind."""
+    shapes: list[Field] = [("H", 0)] * 4  # segmented, rectangular, radial, dynamic
+    return [("f", 1.0), ("f", 0.0), ("I", 1), ("i", 0), ("B", 0), ("B", number), *shapes]
 
 
 def _parsed(payload: bytes, *, binary: bool) -> _Request:

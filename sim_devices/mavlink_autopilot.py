@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -32,6 +32,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sim_devices.device import F64, Mount, Scene
 from sim_devices.ranging import garbled
+from sim_devices.sonar_faults import SonarTroubles
+from sim_devices.wheel import Undo
 from sim_devices.wire import BITS_PER_BYTE, SECOND_NS, PacedWire
 
 TX_BUFFER = 512  # bytes
@@ -96,6 +98,8 @@ class MavlinkAutopilot:
     `complaint` says what was wrong with the last refused one, `companion_ns` is when a companion's heartbeat came last.
     """
 
+    fault_family = "sonar"
+
     def __init__(
         self,
         scene: Scene,
@@ -114,6 +118,8 @@ class MavlinkAutopilot:
         self.kind = kind
         self.system = system
         self.rangefinders = list(rangefinders)
+        self.sonar_troubles = SonarTroubles()
+        self.fault_families = ("sonar",) if self.rangefinders else ()
         self.clock_drift_ppm = clock_drift_ppm
         self.accepted = self.refused = 0
         self.complaint = ""
@@ -184,6 +190,10 @@ class MavlinkAutopilot:
         for stream in self._streams:
             stream.set_rate(stream.usual_hz, self._zero_ns)
             stream.next_ns = self._zero_ns
+
+    def inflict(self, kind: str, value: float, arguments: Mapping[str, float], now_ns: int) -> Undo | None:
+        """See wheel.Faulty. Channels of its rangefinders are their ids plus one."""
+        return self.sonar_troubles.inflict(kind, value, arguments)
 
     def set_clock_drift(self, ppm: float, now_ns: int) -> None:
         """Let the clock run so much too fast from now on; it does not jump."""
@@ -263,8 +273,17 @@ class MavlinkAutopilot:
 
     def _distances(self, now_ns: int) -> list[Any]:
         out = []
+        places = {sensor.number + 1: sensor for sensor in self.rangefinders}
         for sensor in self.rangefinders:
-            range_m = self._scene.cone_range(sensor.mount, sensor.half_angle_rad, now_ns, sensor.max_cm * 0.01)
+
+            def measure(channel: int, sensor: Rangefinder = sensor) -> float:
+                there = places.get(channel, sensor)
+                return self._scene.cone_range(there.mount, there.half_angle_rad, now_ns, sensor.max_cm * 0.01)
+
+            told_m = self.sonar_troubles.told_m(sensor.number + 1, measure, self._random, sensor.max_cm * 0.01)
+            if told_m is None:
+                continue
+            range_m = told_m
             heard = math.isfinite(range_m) and range_m * 100.0 <= sensor.max_cm
             cm = max(sensor.min_cm - 1, round(range_m * 100.0)) if heard else sensor.max_cm + 1
             cone_rad = 2.0 * sensor.half_angle_rad

@@ -29,7 +29,7 @@ from sim_devices.lasers import FIRST_MODEL, MODELS, make_laser
 from sim_devices.mount_nodding import SolidScene, Swing, TiltedScene, angle_encoder
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.sonar_maxbotix import FAMILIES, MaxBotix, TextMultiplexer
-from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardCan, UsBoardSerial, default_parameters
+from sim_devices.sonar_usboard import ANALOG_ON, Transducer, UsBoard, UsBoardCan, UsBoardSerial, default_parameters
 from sim_devices.udp_link import UdpLink
 from sim_devices.wheel import Side, Wheel
 
@@ -108,6 +108,8 @@ def emulate(
         builder.add_laser(name, table, laser, profile, exact=exact, seed=seed + k, number=k)
     for k, (name, sonar) in enumerate(sorted(robot.config.get("sonars", {}).items())):
         builder.add_sonar(name, sonar, seed=seed + 100 + k)
+    for k, (name, contacts) in enumerate(sorted(robot.config.get("contacts", {}).items())):
+        builder.add_usboard_contacts(name, contacts, seed=seed + 200 + k)
     for name, wheels in robot.config.get("wheels", {}).items():
         builder.add_wheels(name, wheels)
     for name, mount in robot.config.get("mounts", {}).items():
@@ -133,6 +135,7 @@ class _Builder:
     plan: FaultPlan
     faulty: bool
     in_memory: bool
+    _joined: set[str] = field(default_factory=set)  # tables of switches that are on a board with sonars
 
     def add_bus(self, name: str, bus: Table) -> None:
         can = CanBus(bitrate_bps=int(bus.get("bitrate_bps", 1000000)))
@@ -193,15 +196,47 @@ class _Builder:
             device = self._maxbotix(sonar, self._seen(target), f"sonars.{name}", seed)
             self._attach_serial(f"sonars.{name}", f"sonar-{name}", [sonar], target, device)
             return
-        half_angle_rad = _half_cone_rad(sonar)
-        transducers = {channel: Transducer(m, half_angle_rad) for channel, m in _transducer_mounts(sonar).items()}
-        base_id = int(sonar.get("base_id", 0x400))
-        parameters = default_parameters(base_id, serial=20000 + base_id)
-        board = self.robot.sonars[name] = UsBoard(self._seen(target), transducers, parameters=parameters, seed=seed)
+        switches = self._contacts_on(sonar)
+        board = self.robot.sonars[name] = self._usboard(sonar, self._seen(target), switches, seed)
         if driver == "usboard":
             self._join(_bus_of(self.robot, sonar, f"sonars.{name}"), target, UsBoardCan(board))
         else:
-            self._attach_serial(f"sonars.{name}", f"sonar-{name}", [sonar], target, UsBoardSerial(board))
+            tables = [sonar, *(self.robot.config["contacts"][each] for each in switches)]
+            self._attach_serial(f"sonars.{name}", f"sonar-{name}", tables, target, UsBoardSerial(board))
+
+    def add_usboard_contacts(self, name: str, contacts: Table, *, seed: int) -> None:
+        """A USBoard that has switches only; those of boards with sonars are there already."""
+        driver = contacts.get("driver")
+        if driver not in ("usboard", "usboard-serial") or name in self._joined:
+            return
+        target = f"contact.{name}"
+        board = self._usboard(contacts, self._seen(target), [name], seed)
+        if driver == "usboard":
+            self._join(_bus_of(self.robot, contacts, f"contacts.{name}"), target, UsBoardCan(board))
+        else:
+            self._attach_serial(f"contacts.{name}", f"contact-{name}", [contacts], target, UsBoardSerial(board))
+
+    def _contacts_on(self, sonar: Table) -> list[str]:
+        """The switches at the inputs of the board that these sonars are on: at most one table of them."""
+        keys = ("driver", "can", "base_id") if sonar["driver"] == "usboard" else ("driver", "port")
+        board = [sonar.get(key, 0x400 if key == "base_id" else None) for key in keys]
+        found = [
+            name
+            for name, each in self.robot.config.get("contacts", {}).items()
+            if [each.get(key, 0x400 if key == "base_id" else None) for key in keys] == board
+        ]
+        self._joined.update(found)
+        return found[:1]
+
+    def _usboard(self, table: Table, scene: Scene, contacts: list[str], seed: int) -> UsBoard:
+        half_angle_rad = _half_cone_rad(table)
+        transducers = {channel: Transducer(m, half_angle_rad) for channel, m in _transducer_mounts(table).items()}
+        base_id = int(table.get("base_id", 0x400))
+        parameters = bytearray(default_parameters(base_id, serial=20000 + base_id))
+        if contacts:
+            parameters[5] |= ANALOG_ON
+        switches = self._switches(contacts[0]) if contacts else {}
+        return UsBoard(scene, transducers, parameters=bytes(parameters), switches=switches, seed=seed)
 
     def _maxbotix(self, sonar: Table, scene: Scene, place: str, seed: int) -> MaxBotix | TextMultiplexer:
         """One sensor or several behind a multiplexer; the rate in the configuration becomes what they can do."""

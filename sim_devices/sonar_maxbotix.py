@@ -26,6 +26,7 @@ from math import inf, isfinite, radians
 import numpy as np
 
 from sim_devices.device import Mount, Scene
+from sim_devices.sonar_faults import FOREIGN_SHARE
 from sim_devices.wheel import Undo
 from sim_devices.wire import SECOND_NS, PacedWire
 
@@ -84,6 +85,7 @@ class _Ear:
         self.air_temp_c = 20.0
         self.stuck_m: float | None = None
         self.is_connected = True
+        self.foreign = 0.0  # share of readings that hear another's pulse
         self._random = np.random.default_rng(seed)
 
     def text(self, now_ns: int) -> bytes:
@@ -95,6 +97,8 @@ class _Ear:
         if isfinite(range_m):
             range_m *= SOUND_AT_20_C / (331.3 + 0.606 * self.air_temp_c)
             range_m = max(0.0, range_m + self.noise_m * float(self._random.standard_normal()))
+        if self.foreign and self._random.random() < self.foreign:
+            range_m = min(range_m, reach_m * float(self._random.random()))
         return self.family.text(range_m if isfinite(range_m) else inf)
 
 
@@ -108,6 +112,8 @@ def _inflict(ears: Mapping[int, _Ear], kind: str, value: float, arguments: Mappi
     if kind == "order_swap":
         pair = [ears[n] for n in (channel or 1, round(arguments.get("with", 2))) if n in ears]
         return _swap(pair[0], pair[1]) if len(pair) == 2 else None
+    if kind == "cross_talk":
+        return _set_all(hit, "foreign", FOREIGN_SHARE)
     if kind in ("stuck", "temperature"):
         return _set_all(hit, {"stuck": "stuck_m", "temperature": "air_temp_c"}[kind], value)
     return None

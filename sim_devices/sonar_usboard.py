@@ -19,7 +19,7 @@ stops half-way for 50 ms is forgotten.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, inf, isfinite, radians
 
@@ -39,6 +39,7 @@ SPOILED_AFTER_NS = 50_000_000
 INTERVALS_MS = {0: 500, 1: 1000, 2: 2000, 3: 200}
 CUSTOM_INTERVAL = 15
 ON_CAN, ON_SERIAL = 1, 2
+ANALOG_ON = 4  # in parameter byte 5
 RESOLUTIONS_M = (0.01, 0.005, 0.0025, 0.00125)
 SOUND_AT_20_C = 343.4  # what the board reckons with
 
@@ -64,7 +65,8 @@ class UsBoard:
     transducers: channel (1..16) -> what is connected there.  parameters: the 54 bytes of its EEPROM.
     range_min_m, range_max_m: what it can measure.  noise_m: standard deviation of a distance.
     air_temp_c: true air temperature; the board reckons with the speed of sound at 20 degrees.
-    analog: four 12-bit levels of its inputs.  eeprom_s: time that storing one part takes.
+    analog: four 12-bit levels of its inputs.  switches: lines at those inputs (0..3), pulled up to 5 V; told the time,
+    whether the line is high.  eeprom_s: time that storing one part takes.
     Faults: `hears` lists boards whose pulses this one takes for its own echoes; `stuck_m` gives channels that always
     read the same.
     """
@@ -80,6 +82,7 @@ class UsBoard:
         noise_m: float = 0.005,
         air_temp_c: float = 20.0,
         analog: Sequence[int] = (0, 0, 0, 0),
+        switches: Mapping[int, Callable[[int], bool]] | None = None,
         boot_s: float = 0.25,
         eeprom_s: float = 0.02,
         seed: int = 0,
@@ -96,6 +99,7 @@ class UsBoard:
         self.noise_m = noise_m
         self.air_temp_c = air_temp_c
         self.analog = list(analog)
+        self.switches = dict(switches or {})
         self.eeprom_s = eeprom_s
         self.hears: list[UsBoard] = []
         self.stuck_m: dict[int, float] = {}
@@ -167,7 +171,7 @@ class UsBoard:
             parts = (bytes((READ, i)) + self.parameters[PART * i : PART * (i + 1)] for i in range(9))
             return [(6, bytes(part), now_ns) for part in parts]
         elif command == ANALOG:
-            return [(7, bytes((ANALOG, *packed_12bit(self.analog), 0)), now_ns)]
+            return [(7, bytes((ANALOG, *packed_12bit(self._inputs(now_ns)), 0)), now_ns)]
         elif command == DATA and not self.is_v1:
             return [(13 + g, self._group_frame(g, now_ns), now_ns) for g in range(4) if padded[1] >> g & 1]
         return []
@@ -191,6 +195,14 @@ class UsBoard:
             return [(13 + g, self._group_frame(g, now_ns)) for g in groups]
         frames = [*self._short_frames(DATA_1TO8, now_ns), *self._short_frames(DATA_9TO16, now_ns)]
         return [frames[g] for g in groups]
+
+    def _inputs(self, now_ns: int) -> list[int]:
+        """Levels of the four inputs: what stands there, or a line near ground or near 5 V, with a little noise."""
+        levels = list(self.analog)
+        for line, is_high in self.switches.items():
+            stray = int(self._random.integers(0, 60))
+            levels[line] = 4095 - stray if is_high(now_ns) else stray
+        return levels
 
     def _write(self, command: int, message: bytes, now_ns: int) -> list[tuple[int, bytes, int]]:
         part = message[1]

@@ -1,8 +1,9 @@
 """Other people's laser drivers on the emulated lasers, over ptys and TCP, held against the room they stand in.
 
 Packages: pyrplidarsdk (the maker's SDK), rplidar-roboticia, pyrplidar, lds2d. Programs, if they are on the PATH:
-lms2xx_simple_app (sicktoolbox), ldlidar_stl_node (ldlidar_stl_sdk), sick_generic_caller (sick_scan_xd, built without
-ROS; its launch files in the folder named by SICK_SCAN_LAUNCH).
+lms2xx_simple_app and lms2xx_set_variant (sicktoolbox), ldlidar_stl_node (ldlidar_stl_sdk), ultra_simple (rplidar_sdk),
+sick_generic_caller (sick_scan_xd, built without ROS; its launch files in the folder named by SICK_SCAN_LAUNCH),
+rawlog-grabber and rawlog-edit (mrpt-apps), the C samples of urg_library in the folder named by URG_SAMPLES.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from sim_devices.device import F64, ByteDevice, Mount
 from sim_devices.laser_hokuyo import PROFILES, HokuyoLaser
 from sim_devices.laser_ldrobot import LdLidar
 from sim_devices.laser_rplidar import RPLIDAR_PROFILES, RpLidar
-from sim_devices.laser_sick_cola import SickColaLaser
+from sim_devices.laser_sick_cola import COLA_PROFILES, SickColaLaser
 from sim_devices.laser_sick_lms2xx import SickLms2xxLaser
 
 NOISE_M = (
@@ -210,21 +211,143 @@ def test_makers_sdk_reads_an_ld06(tmp_path: Path) -> None:
     assert all(size == pytest.approx(450, abs=12) for size in sizes[1:])
 
 
-@needs_program("sick_generic_caller")
-@pytest.mark.skipif(not os.environ.get("SICK_SCAN_LAUNCH"), reason="needs SICK_SCAN_LAUNCH")
-def test_makers_driver_starts_a_tim() -> None:
-    laser, link = SickColaLaser(Room()), TcpLink(0)
+@needs_program("lms2xx_set_variant")
+def test_sicktoolbox_changes_the_variant(tmp_path: Path) -> None:
+    with on_a_pty(SickLms2xxLaser(Room()), tmp_path / "laser") as port:
+        out = heard(["lms2xx_set_variant", port, "38400"], r"Num\. Values: 361", 40.0)
+    counts = [int(count) for count in re.findall(r"Num\. Values: (\d+)", out)]
+    assert {401, 361} <= set(counts), "100 degrees by a quarter, then 180 by a half"
+
+
+@needs_program("ultra_simple")
+@pytest.mark.parametrize(("model", "baud"), [("a1", "115200"), ("a2", "115200"), ("a2m7", "256000")])
+def test_makers_own_sample_reads_turns(model: str, baud: str, tmp_path: Path) -> None:
+    with on_a_pty(RpLidar(Room(), profile=RPLIDAR_PROFILES[model]), tmp_path / "laser") as port:
+        program = ["stdbuf", "-o0", "ultra_simple", "--channel", "--serial", port, baud]
+        out = heard(program, r"theta: 0\.\d\d .*", 20.0)
+    points = re.findall(r"theta: +([\d.]+) Dist: +([\d.]+) Q", out)
+    assert "health status : 0" in out
+    assert mean_error_m([float(a) for a, _ in points], [float(d) * 1e-3 for _, d in points]) < NOISE_M
+
+
+# -- MRPT --------------------------------------------------------------------------------------------------------------
+
+
+MRPT: dict[str, tuple[Any, list[str]]] = {
+    "hokuyo-urg": (lambda: HokuyoLaser(Room(), link="usb"), ["CHokuyoURG", "COM_baudRate = 115200"]),
+    "hokuyo-utm": (
+        lambda: HokuyoLaser(Room(), profile=PROFILES["utm-30lx"]),
+        ["CHokuyoURG", "COM_baudRate = 115200"],
+    ),
+    "hokuyo-ust": (
+        lambda: HokuyoLaser(Room(), profile=PROFILES["ust-10lx"]),
+        ["CHokuyoURG", "IP_DIR = 127.0.0.1", "PORT_DIR = {port}"],
+    ),
+    "rplidar": (lambda: RpLidar(Room()), ["CRoboPeakLidar"]),
+    "lms200": (
+        lambda: SickLms2xxLaser(Room()),
+        ["CSickLaserSerial", "COM_baudRate = 38400", "mm_mode = true", "FOV = 180", "resolution = 50"],
+    ),
+    "lms111": (
+        lambda: SickColaLaser(Room(), profile=COLA_PROFILES["lms111"]),
+        ["CLMS100Eth", "ip_address = 127.0.0.1", "TCP_port = {port}"],
+    ),
+}
+
+
+@needs_program("rawlog-grabber")
+@needs_program("rawlog-edit")
+@pytest.mark.parametrize("device", MRPT)
+def test_mrpt_records_scans_of_the_room(device: str, tmp_path: Path) -> None:
+    make, keys = MRPT[device]
+    on_tcp = any("{port}" in key for key in keys)
+    link: PtyLink | TcpLink = TcpLink(0) if on_tcp else PtyLink(tmp_path / "laser")
+    place = f"{link.port}" if isinstance(link, TcpLink) else ""
+    lines = [f"driver = {keys[0]}", *(key.format(port=place) for key in keys[1:])]
+    if not on_tcp:
+        lines.append(f"COM_port_LIN = {tmp_path / 'laser'}")
+    pose = [f"pose_{axis} = 0" for axis in ("x", "y", "z", "yaw", "pitch", "roll")]
+    whole = [
+        "[global]",
+        f"rawlog_prefix = {tmp_path / 'log'}",
+        "time_between_launches = 300",
+        "GRABBER_PERIOD_MS = 500",
+    ]
+    whole += ["use_sensoryframes = false", "rawlog_GZ_compress_level = 0", "[LASER]", "process_rate = 90"]
+    (tmp_path / "grab.ini").write_text("\n".join([*whole, "sensorLabel = laser", *lines, *pose]) + "\n")
+    loop = Attachment()
+    loop.add("laser", make(), link)
+    with loop:
+        time.sleep(1.6)
+        seconds = 16 if device == "lms111" else 6  # it asks for the state of an LMS100 each 10 s
+        subprocess.run(
+            ["bash", "-c", f"sleep {seconds} | rawlog-grabber {tmp_path / 'grab.ini'}"],
+            cwd=tmp_path, capture_output=True, timeout=seconds + 20, check=False,
+        )  # fmt: skip
+    (log,) = tmp_path.glob("log*.rawlog")
+    subprocess.run(
+        ["rawlog-edit", "-i", log.name, "--export-2d-scans-txt"],
+        cwd=tmp_path,
+        capture_output=True,
+        timeout=30,
+        check=True,
+    )
+    ranges = next(path for path in tmp_path.glob("log*_laser.txt") if "times" not in path.name)
+    scans = np.atleast_2d(np.loadtxt(ranges))  # each line: time, ranges, which of them are valid
+    assert len(scans) >= 3
+    count = (scans.shape[1] - 1) // 2
+    assert scans[-1, 1 + count // 2] == pytest.approx(3.0, abs=0.1), "straight ahead"
+    assert scans[-1, 1 + count :].mean() > 0.7
+
+
+# -- Hokuyo's own library ----------------------------------------------------------------------------------------------
+
+
+def urg_sample(name: str, *arguments: str) -> str:
+    program = Path(os.environ["URG_SAMPLES"]) / name
+    return subprocess.run([program, *arguments], capture_output=True, text=True, timeout=30.0, check=True).stdout
+
+
+@pytest.mark.skipif(not os.environ.get("URG_SAMPLES"), reason="needs URG_SAMPLES")
+@pytest.mark.parametrize("kind", ["tcp", "serial, in SCIP 1.1"])
+def test_makers_library_reads_a_hokuyo(kind: str, tmp_path: Path) -> None:
+    link: PtyLink | TcpLink
+    if kind == "tcp":
+        laser, link = HokuyoLaser(Room(), profile=PROFILES["ust-10lx"]), TcpLink()  # the samples know one port
+        place = ("-e", "127.0.0.1")
+    else:
+        laser, link = HokuyoLaser(Room(), start_in_scip1=True), PtyLink(tmp_path / "laser")
+        place = ("-s", str(tmp_path / "laser"))
     loop = Attachment()
     loop.add("laser", laser, link)
-    launch = Path(os.environ["SICK_SCAN_LAUNCH"]) / "sick_tim_5xx.launch"
+    with loop:
+        time.sleep(1.6)
+        assert f"sensor data size: {1081 if kind == 'tcp' else 726}" in urg_sample("sensor_parameter", *place)
+        for name in ("get_distance", "get_distance_handshake"):
+            told = re.findall(r"(\d+) \[mm\]", urg_sample(name, *place))
+            assert len(told) == 10
+            assert np.mean([int(value) for value in told]) == pytest.approx(3000, abs=20)
+        assert len(urg_sample("sync_time_stamp", *place).splitlines()) > 5
+        if kind == "tcp":
+            assert "3" in urg_sample("get_distance_intensity", *place)
+
+
+@needs_program("sick_generic_caller")
+@pytest.mark.skipif(not os.environ.get("SICK_SCAN_LAUNCH"), reason="needs SICK_SCAN_LAUNCH")
+@pytest.mark.parametrize(("profile", "file"), [("tim571", "sick_tim_5xx"), ("lms111", "sick_lms_1xx")])
+def test_makers_driver_starts_a_scanner(profile: str, file: str) -> None:
+    laser, link = SickColaLaser(Room(), profile=COLA_PROFILES[profile]), TcpLink(0)
+    loop = Attachment()
+    loop.add("laser", laser, link)
+    launch = Path(os.environ["SICK_SCAN_LAUNCH"]) / f"{file}.launch"
     with loop:
         time.sleep(1.5)
         command = ["sick_generic_caller", str(launch), "hostname:=127.0.0.1", f"port:={link.port}"]
         out = heard(command, "packets dropped. Software PLL not yet locked", 20.0)
-    assert "Angle resolution of scanner is 0.3333" in out
+    assert profile != "tim571" or "Angle resolution of scanner is 0.3333" in out
     assert "sEA LMDscandata" in out
     assert "sFA" not in out
-    assert link.counters.sent_bytes > 5 * 3374
+    assert link.counters.sent_bytes > 5 * (3374 if profile == "tim571" else 1100)
 
 
 @needs("hokuyolx")

@@ -174,5 +174,5 @@ def test_random_bytes_raise_nothing_and_hardly_ever_pass() -> None:
 def test_slow_lists_are_not_taken_for_silence() -> None:
     conversation = MaxBotixConversation("hr-5m", form="list", channels=(1, 2, 3))
     assert conversation.silence_limit_ns > 500 * MS
-    assert MaxBotixConversation("lv").silence_limit_ns == 200 * MS
+    assert MaxBotixConversation("lv").silence_limit_ns == 147 * MS
     assert MaxBotixConversation("hr-5m").silence_limit_ns == 450 * MS

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.conversation import CanFrame
 from drivers.errors import FrameError
-from drivers.readings import ChainReading, LinkState, RangeReading, RangeStatus, Reading
+from drivers.readings import ChainReading, ContactReading, ContactState, LinkState, RangeReading, RangeStatus, Reading
 from drivers.sonar_usboard import UsBoardConversation, UsBoardSerialConversation
 from drivers.usboard_messages import (
     Command,
@@ -83,6 +83,7 @@ class ScriptedBoard:
         self.dead_groups: set[int] = set()
         self.heard: list[int] = []
         self.raw = 200
+        self.inputs = [0, 4095, 2048, 0]
 
     def answer(self, message: bytes) -> list[bytes]:
         command = message[0]
@@ -95,6 +96,10 @@ class ScriptedBoard:
             return [bytes((6, i)) + self.block[6 * i : 6 * i + 6] for i in range(9)]
         if command == 13:
             return [self.group(g) for g in range(4) if message[1] >> g & 1 and g not in self.dead_groups]
+        if command == 7:
+            nibbles = [value >> 8 for value in self.inputs]
+            return [bytes((7, *(v & 0xFF for v in self.inputs), nibbles[0] | nibbles[1] << 4,
+                           nibbles[2] | nibbles[3] << 4, 0))]  # fmt: skip
         if command in (2, 3):
             return [bytes((command, part, 30, 40, 50, 60, 0, 0)) for part in (0, 1)]
         return []
@@ -321,7 +326,54 @@ def test_as_fast_as_it_fires() -> None:
     conversation.connected(0)
     converse(conversation, board, 0, 1_010 * MS)
     assert board.heard.count(13) == pytest.approx(25, abs=1)  # 4 x 10 ms a round
-    assert conversation.silence_limit_ns == 200 * MS
+    assert conversation.silence_limit_ns == 120 * MS
+
+
+def contacts_of(readings: Iterable[Reading]) -> list[dict[int, ContactState]]:
+    return [{each.line: each.state for each in r.lines} for r in readings if isinstance(r, ContactReading)]
+
+
+def test_switches_at_the_inputs() -> None:
+    """Low, high, and what is neither: a line that is torn half-way is not believed."""
+    board = ScriptedBoard()
+    conversation = UsBoardConversation(
+        channels=[1], switches={0: False, 1: False, 2: False, 3: True}, analog_rate_hz=20.0
+    )
+    conversation.connected(0)
+    readings = converse(conversation, board, 0, 1_000 * MS)
+    told = contacts_of(readings)
+    clear, tripped, unknown = ContactState.CLEAR, ContactState.TRIPPED, ContactState.UNKNOWN
+    assert told[-1] == {0: clear, 1: tripped, 2: unknown, 3: tripped}
+    assert len(told) == pytest.approx(20, abs=2)
+    assert conversation.counters.drops == {"between_levels": len(told)}
+    assert set(echoes_cm(readings)) == {1}
+    assert conversation.silence_limit_of(ContactReading) == 150 * MS
+    stamps = [r.stamp_ns for r in readings if isinstance(r, ContactReading)]
+    assert stamps == sorted(set(stamps))
+
+
+def test_a_board_of_switches_alone_is_not_asked_for_ranges() -> None:
+    board = ScriptedBoard()
+    conversation = UsBoardConversation(switches={1: True}, analog_rate_hz=20.0, measures=False)
+    conversation.connected(0)
+    readings = converse(conversation, board, 0, 3_000 * MS)
+    assert contacts_of(readings)[-1] == {1: ContactState.CLEAR}
+    assert not ranges_of(readings)
+    assert set(board.heard) == {0, 6, 7}
+    assert state_of(conversation) is LinkState.RUNNING
+    assert conversation.counters.drops == {}
+
+
+def test_inputs_that_the_board_keeps_to_itself_are_named() -> None:
+    board = ScriptedBoard()
+    board.deaf_to = {7}
+    conversation = UsBoardConversation(channels=[1], switches={0: False}, analog_rate_hz=20.0)
+    conversation.connected(0)
+    assert contacts_of(converse(conversation, board, 0, 1_000 * MS)) == []
+    assert "byte 5, bit 2" in (conversation.trouble_of(ContactReading) or "")
+    assert conversation.trouble_of(ChainReading) is None
+    with pytest.raises(ValueError, match="inputs 0 to 3"):
+        UsBoardConversation(switches={4: False})
 
 
 def test_connect_is_repeated_until_answered_without_end() -> None:

@@ -33,6 +33,22 @@ enabled = false
 """
 
 
+USBOARD = """
+[can.main]
+interface = "slcan"
+channel = "/dev/ttyACM0"
+[sonars.ring]
+driver = "usboard"
+can = "main"
+transducers = [{ channel = 1 }]
+[contacts.bumpers]
+driver = "usboard"
+can = "main"
+base_id = 0x420
+switches = [{ line = 0, x_m = 0.26 }, { line = 1, x_m = -0.26 }]
+"""
+
+
 def read(folder: Path, text: str) -> Config:
     file = folder / "umfeld.toml"
     file.write_text(text)
@@ -54,10 +70,27 @@ def test_switches_share_the_board_and_feed_maps(tmp_path: Path) -> None:
     warm_up(config)
 
 
+@pytest.mark.parametrize("base_id", ["0x400", "0x420"])
+def test_switches_of_a_usboard_stand_with_its_sonars_or_alone(tmp_path: Path, base_id: str) -> None:
+    config = read(tmp_path, USBOARD.replace("0x420", base_id))
+    (wire,) = assemble.wires(config)
+    assert set(wire.conversations) == {"bumpers", "ring"}
+    made = {name: make() for name, make in wire.conversations.items()}
+    asked = [conversation.connected(0) or len(conversation.requests(0)) for conversation in made.values()]
+    assert sum(asked) == (1 if base_id == "0x400" else 2), "one board, one host; two boards, one host each"
+    warm_up(config)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         (BUMPERS.replace("line = 5", "line = 4"), "two switches have the same line"),
+        (USBOARD.replace("line = 1", "line = 4"), "inputs 0 to 3, not 4"),
+        (USBOARD.replace("0x420", "0x410"), "uses CAN id 0x410"),
+        (
+            USBOARD + '[contacts.more]\ndriver = "usboard"\ncan = "main"\nbase_id = 0x420\nswitches = [{ line = 0 }]\n',
+            "uses CAN id 0x420",
+        ),
         ('[drive]\npose_source = "pilot"\n', "there is no [poses.pilot]"),
         ('[poses.pilot]\ndriver = "mavlink"\nport = "/dev/ttyACM0"\n', 'add pose_source = "pilot" to [drive]'),
         ('[drive]\nsource = "a"\npose_source = "b"\n', "keep one of them"),
@@ -164,14 +197,33 @@ def table(**sections: Table) -> Table:
     return {"sectors": {"polar": {"around": around}}, "store": {"enabled": False}, **sections}
 
 
-def test_a_bumper_at_the_wall_blocks_and_one_before_it_does_not() -> None:
+CAN = {"can": {"main": {"interface": "slcan", "channel": "main", "bitrate_bps": 1000000}}}
+HEADS = {"transducers": [{"channel": 1, "x_m": 0.1}], "cone_deg": 20.0}
+BOARDS = {
+    "arduino-bridge": ({"driver": "arduino-bridge", "port": "/dev/ttyUSB0"}, {}),
+    "usboard": ({"driver": "usboard", "can": "main", "base_id": 0x420}, CAN),
+    "usboard, with sonars": (
+        {"driver": "usboard", "can": "main"},
+        {**CAN, "sonars": {"side": {"driver": "usboard", "can": "main", **HEADS}}},
+    ),
+    "usboard-serial": ({"driver": "usboard-serial", "port": "/dev/ttyUSB0"}, {}),
+    "usboard-serial, with sonars": (
+        {"driver": "usboard-serial", "port": "/dev/ttyUSB0"},
+        {"sonars": {"side": {"driver": "usboard-serial", "port": "/dev/ttyUSB0", **HEADS}}},
+    ),
+}
+
+
+@pytest.mark.parametrize("board", BOARDS)
+def test_a_bumper_at_the_wall_blocks_and_one_before_it_does_not(board: str) -> None:
     switches = [
-        {"line": 4, "x_m": 1.995, "width_m": 0.2},
-        {"line": 5, "x_m": -1.0, "yaw_deg": 180.0, "width_m": 0.2},
+        {"line": 2, "x_m": 1.995, "width_m": 0.2},
+        {"line": 3, "x_m": -1.0, "yaw_deg": 180.0, "width_m": 0.2},
     ]
-    contacts = {"bumpers": {"driver": "arduino-bridge", "port": "/dev/ttyUSB0", "switches": switches}}
-    with Rig(table(contacts=contacts)) as rig:
-        assert rig.run_until(lambda: rig.is_running("bumpers"), 5.0)
+    device, others = BOARDS[board]
+    with Rig(table(contacts={"bumpers": {**device, "switches": switches}}, **others)) as rig:
+        assert rig.run_until(lambda: all(rig.is_running(each) for each in rig.sensors), 5.0)
+        assert rig.health()["bumpers"].counters.drops == {}
         rig.run(0.5)
         snapshot = rig.maps[-1][1].snapshot
         blocked = snapshot.state == SectorState.OBSTACLE

@@ -163,6 +163,18 @@ def test_noise_and_wrong_sums_are_skipped() -> None:
     assert bench.raw(b"\x02sRN SCdev" + b"\x02sRN SCdevicestate\x03") == b"\x02sRA SCdevicestate 1\x03"
 
 
+def test_lines_and_fields_rest() -> None:
+    """A host of the maker's asks for all of them before it measures, and gives up where one is refused."""
+    bench = Bench()
+    assert bench.ask(b"sRN LIDinputstate") == b"sRA LIDinputstate " + bytes(2 + 4 + 4 + 2)
+    assert bench.ask(b"sRN LIDoutputstate") == b"sRA LIDoutputstate " + bytes(2 + 4 + 3 * 5 + 2)
+    field = struct.pack(">ffIiBB4H", 1.0, 0.0, 1, 0, 0, 47, 0, 0, 0, 0)
+    assert bench.ask(b"sRN field047") == b"sRA field047 " + field
+    assert bench.ask(b"sRN field048") == b"sFA \x03"
+    for name in ("LFErec", "LIDinputstate", "LIDoutputstate"):
+        assert bench.say(f"sEN {name} 1") == f"sEA {name} 1"
+
+
 def test_unknown_things_are_refused_by_their_kind() -> None:
     bench = Bench()
     assert bench.say("sRN Nonsense") == "sFA 3"
