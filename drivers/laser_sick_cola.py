@@ -45,6 +45,7 @@ _RANGE_MAX_M = {"TiM5": 10.0, "TiM7": 25.0, "LMS1": 20.0, "LMS5": 80.0}
 _RANGE_MAX_OTHERS_M = 25.0
 
 IDENTIFY = encode_telegram(b"sRN DeviceIdent")
+ASK_STATE = encode_telegram(b"sRN SCdevicestate")
 SUBSCRIBE = encode_telegram(b"sEN LMDscandata \x01")
 UNSUBSCRIBE = encode_telegram(b"sEN LMDscandata \x00")
 LOG_IN = encode_telegram(b"sMN SetAccessMode \x03\xf4\x72\x47\x44")  # authorised client, as delivered
@@ -114,22 +115,33 @@ class SickColaConversation(ScriptedConversation[Telegram]):
                 yield pause(500 * _MS)
 
     def _find(self) -> Generator[Step[Telegram], Telegram | None, None]:
-        """Ask who it is until anything in CoLa binary comes back."""
+        """Ask who it is, then how it is (some know that only), until anything in CoLa binary comes back."""
         while True:
             heard_bytes = self._counters.bytes
-            reply = yield Step((IDENTIFY,), lambda reply: reply.scan is None, REPLY_NS)
-            if reply is not None:
-                if reply.payload.startswith(b"sRA DeviceIdent"):
-                    self._name = decode_identity(reply.payload)
-                    self._note_identity()
+            if (yield from self._answers(IDENTIFY)):
                 return
-            self._state = LinkState.SILENT
-            if self._counters.bytes > heard_bytes:
-                self._trouble = (
-                    "answers, but not in CoLa binary: set its protocol to CoLa B (SOPAS: network, CoLa dialect binary)"
-                )
-            else:
-                self._trouble = "is connected but does not answer: is this the CoLa port (2112 or 2111)?"
+            self._tell_silence(heard_bytes)
+            if (yield from self._answers(ASK_STATE)):
+                yield from self._answers(IDENTIFY)
+                self._note_identity()
+                return
+
+    def _answers(self, question: bytes) -> _Script:
+        """Whether anything comes back; a name is kept."""
+        reply = yield Step((question,), lambda reply: reply.scan is None, REPLY_NS)
+        if reply is not None and reply.payload.startswith(b"sRA DeviceIdent"):
+            self._name = decode_identity(reply.payload)
+            self._note_identity()
+        return reply is not None
+
+    def _tell_silence(self, heard_bytes: int) -> None:
+        self._state = LinkState.SILENT
+        if self._counters.bytes > heard_bytes:
+            self._trouble = (
+                "answers, but not in CoLa binary: set its protocol to CoLa B (SOPAS: network, CoLa dialect binary)"
+            )
+        else:
+            self._trouble = "is connected but does not answer: is this the CoLa port (2112 or 2111)?"
 
     def _subscribe(self) -> _Script:
         self._period_ns = 100.0 * _MS  # scans may follow the reply in the same chunk
@@ -142,7 +154,7 @@ class SickColaConversation(ScriptedConversation[Telegram]):
 
     def _has_scans(self) -> _Script:
         """Whether scans come; if not, the measurement is started once and waited for."""
-        if (yield self._awaiting_scans(FIRST_SCAN_NS)) is not None:
+        if (yield from self._awaits_scans(FIRST_SCAN_NS)):
             return True
         if not self._may_start:
             self._trouble = "measures nothing: start it, or set start = true"
@@ -152,13 +164,19 @@ class SickColaConversation(ScriptedConversation[Telegram]):
         yield Step((START_MEASURING,), _starts(b"sAN LMCstartmeas", b"sFA"), REPLY_NS)
         yield Step((RUN,), _starts(b"sAN Run", b"sFA"), REPLY_NS)
         yield Step((SUBSCRIBE,), _starts(b"sEA LMDscandata", b"sSN LMDscandata", b"sFA"), REPLY_NS)
-        if (yield self._awaiting_scans(STARTED_SCAN_NS)) is not None:
+        if (yield from self._awaits_scans(STARTED_SCAN_NS)):
             return True
         self._trouble = "sends no scans although it was started: is it in standby, or being configured by SOPAS?"
         return False
 
-    def _awaiting_scans(self, wait_ns: int) -> Step[Telegram]:
-        return Step((), lambda telegram: telegram.scan is not None, wait_ns)
+    def _awaits_scans(self, wait_ns: int) -> _Script:
+        """Whether a scan comes. Meanwhile it is asked how it is: a TCP connection on which nothing comes looks dead."""
+        questions: tuple[bytes, ...] = ()
+        for _ in range(wait_ns // REPLY_NS):
+            if (yield Step(questions, lambda telegram: telegram.scan is not None, REPLY_NS)) is not None:
+                return True
+            questions = (ASK_STATE,)
+        return False
 
     def _note_identity(self) -> None:
         serial = "" if self._serial is None else f"{self._serial:08d}"

@@ -24,7 +24,16 @@ from drivers.cola import (
     trouble_of_status,
 )
 from drivers.errors import FrameError
-from drivers.laser_sick_cola import IDENTIFY, LOG_IN, RUN, START_MEASURING, SUBSCRIBE, UNSUBSCRIBE, SickColaConversation
+from drivers.laser_sick_cola import (
+    ASK_STATE,
+    IDENTIFY,
+    LOG_IN,
+    RUN,
+    START_MEASURING,
+    SUBSCRIBE,
+    UNSUBSCRIBE,
+    SickColaConversation,
+)
 from drivers.readings import LinkState, ScanReading
 
 MS = 1_000_000
@@ -227,6 +236,10 @@ class TestRecorded:
 class Peer:
     measures: bool = True
     speaks_binary: bool = True
+    knows_its_name: bool = True
+    warms_up_ns: int = 0
+    measures_from_ns: int = 1 << 62
+    told: list[int] = field(default_factory=list)
     power: bool = True
     raw: list[int] = field(default_factory=lambda: [1000 + i for i in range(811)])
     clock_us: int = (1 << 32) - 3_000_000  # wraps after three seconds
@@ -246,25 +259,30 @@ class Peer:
         self.received.append(payload)
         if not self.speaks_binary:
             self.out.append((now_ns + MS, b"\x02sFA 1\x03"))
-        elif payload == b"sRN DeviceIdent":
+        elif payload == b"sRN SCdevicestate":
+            self.tell(b"sRA SCdevicestate \x01", now_ns)
+        elif payload == b"sRN DeviceIdent" and self.knows_its_name:
             self.tell(b"sRA DeviceIdent \x00\x07TiM551B\x00\x04V2.5", now_ns)
         elif payload.startswith(b"sEN LMDscandata "):
             self.sends = payload[-1] == 1
             self.tell(b"sEA LMDscandata " + payload[-1:], now_ns)
         elif payload == b"sMN Run":
-            self.measures = True
+            self.measures_from_ns = now_ns + self.warms_up_ns
             self.tell(b"sAN Run \x01", now_ns)
         elif payload.startswith(b"sMN"):
             self.tell(b"sAN" + payload[3:].split(b" ")[0] + payload[3:18] + b" \x01", now_ns)
 
     def tell(self, payload: bytes, now_ns: int) -> None:
         self.out.append((now_ns + self.delay_ns, telegram(payload)))
+        self.told.append(now_ns)
 
     def turn(self, now_ns: int) -> None:
         """A scan of 50 ms every 1/15 s, sent 6 ms after its last beam."""
         while (end_ns := self.scan * S // 15 + 50 * MS) <= now_ns:
             self.scan += 1
+            self.measures = self.measures or now_ns >= self.measures_from_ns
             if self.power and self.sends and self.measures:
+                self.told.append(now_ns)
                 us = [(self.clock_us + at // 1000) % (1 << 32) for at in (end_ns, end_ns + 6 * MS)]
                 payload = scan_payload(self.raw, scan_us=us[0], sent_us=us[1], serial=self.serial, status=self.status)
                 self.out.append((end_ns + 6 * MS + self.delay_ns + self.late_ns(self.scan), telegram(payload)))
@@ -369,12 +387,31 @@ def test_a_scanner_that_does_not_measure_is_started() -> None:
     d.run(4.0)
     assert d.state is LinkState.RUNNING
     sent = [telegram(each) for each in d.peer.received]
-    assert sent[2:5] == [LOG_IN, START_MEASURING, RUN]
+    assert sent[2:8] == [ASK_STATE, ASK_STATE, ASK_STATE, LOG_IN, START_MEASURING, RUN]
     d = desk(Peer(measures=False), start=False)
     d.run(4.0)
     assert d.state is LinkState.STARTING
     assert "start = true" in d.trouble
     assert LOG_IN not in [telegram(each) for each in d.peer.received]
+
+
+def test_a_connection_to_a_scanner_that_does_not_measure_yet_never_looks_dead() -> None:
+    """The reader opens a TCP connection again on which nothing came for 1.5 s: the start would never be reached."""
+    d = desk(Peer(measures=False, warms_up_ns=9 * S))
+    for _ in range(15):
+        heard = len(d.peer.told)
+        d.run(1.0)
+        assert len(d.peer.told) > heard
+    assert d.state is LinkState.RUNNING
+
+
+def test_a_scanner_that_does_not_know_its_name_is_read_all_the_same() -> None:
+    """As other projects' simple servers: they answer what their own driver asks, and nothing else."""
+    d = desk(Peer(knows_its_name=False))
+    d.run(4.0)
+    assert d.state is LinkState.RUNNING
+    assert d.conversation.identity is not None
+    assert d.conversation.identity.model == "CoLa scanner"
 
 
 def test_text_dialect_is_named() -> None:
