@@ -334,7 +334,9 @@ class Bench:
             ]
         if len(readings) < 2:
             return BASELINE_S * 1e3
-        return float(np.median(np.diff([each.stamp_ns for each in readings]))) / 1e6  # a burst after a pause is none
+        intervals_ns = np.sort(np.diff([each.stamp_ns for each in readings]))
+        usual_ns = np.median(intervals_ns[len(intervals_ns) // 2 :])
+        return float(intervals_ns[intervals_ns >= usual_ns / 4.0].mean()) / 1e6  # a burst after a pause is none
 
     def _note_loss(self, row: Row, before: _Reach, begun_ns: int) -> None:
         rig = self.rig

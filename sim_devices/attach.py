@@ -518,15 +518,19 @@ class Attachment:
 
     def service(self, now_ns: int) -> int | None:
         """Serve every station once; returns the earliest time any wants to be served again."""
+        return self._serve_all(lambda: now_ns)
+
+    def _serve_all(self, clock: Callable[[], int]) -> int | None:
+        """Each at its own time: one that measures a sweep for some milliseconds makes the next one's values no older."""
         while not self._posted.empty():
             self._posted.get()()
-        due = [station.service(now_ns) for station in self._stations.values()]
+        due = [station.service(clock()) for station in self._stations.values()]
         return min((at_ns for at_ns in due if at_ns is not None), default=None)
 
     def run(self, until: Callable[[], bool] | None = None) -> None:
         """Serve in this thread until `until()` is true or stop() was called."""
         while not self._ending.is_set() and not (until is not None and until()):
-            due_ns = self.service(self.now_ns())
+            due_ns = self._serve_all(self.now_ns)
             self._wait(due_ns)
 
     def start(self) -> Attachment:

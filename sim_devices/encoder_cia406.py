@@ -271,9 +271,11 @@ class Cia406Encoder:
         for pdo in self._pdos:
             while pdo.next_ns is not None and pdo.next_ns <= now_ns:
                 at_ns = pdo.next_ns if now_ns - pdo.next_ns < SECOND_NS else now_ns
-                if self._event_timer_ms(pdo) or self._pdo_data(pdo, at_ns) != pdo.sent_data:
-                    self._send_pdo(pdo, at_ns, out)
                 self._schedule(pdo, at_ns)
+                is_newest = pdo.next_ns is None or pdo.next_ns > now_ns
+                sampled_ns = now_ns if is_newest else at_ns  # served late: what leaves now was sampled now
+                if self._event_timer_ms(pdo) or self._pdo_data(pdo, sampled_ns) != pdo.sent_data:
+                    self._send_pdo(pdo, sampled_ns, out)
 
     # -- PDOs ---------------------------------------------------------------------------------------------------------
 
