@@ -1,4 +1,4 @@
-"""Other people's drivers on the emulated wheel boards, over ptys: basicmicro, tcr-roboclaw, odrive-can."""
+"""Other people's drivers on the emulated wheel boards, over ptys: basicmicro, tcr-roboclaw, odrive-can, canopen."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ import serial
 from sim_devices.attach import Attachment, PtyLink
 from sim_devices.device import F64, Mount
 from sim_devices.encoder_arduino_bridge import ArduinoBridge, Sonar
+from sim_devices.encoder_cia406 import Cia406Encoder
 from sim_devices.encoder_odrive import ODriveAxis
 from sim_devices.encoder_roboclaw import RoboClaw
 from sim_devices.slcan_hub import CanBus, CanBusStation
@@ -138,6 +139,76 @@ def test_odrive_can_reads_and_drives(tmp_path: Path, generation: str) -> None:
 
     with loop:
         asyncio.run(drive())
+
+
+def _described(objects: dict[int, tuple[str, int]]) -> Any:
+    """An object dictionary as an EDS file would give it: names and types by index, and the two PDOs."""
+    od = importlib.import_module("canopen.objectdictionary")
+
+    def variable(index: int, sub: int, name: str, kind: int) -> Any:
+        made = od.ODVariable(name, index, sub)
+        made.data_type = kind
+        return made
+
+    found = od.ObjectDictionary()
+    for index, (name, kind) in objects.items():
+        found.add_object(variable(index, 0, name, kind))
+    for k in (0, 1):
+        settings, mapped = od.ODRecord("settings", 0x1800 + k), od.ODRecord("mapping", 0x1A00 + k)
+        for sub, kind in ((0, 5), (1, 7), (2, 5), (3, 6), (5, 6)):
+            settings.add_member(variable(0x1800 + k, sub, f"{sub}", kind))
+        for sub, kind in ((0, 5), (1, 7), (2, 7)):
+            mapped.add_member(variable(0x1A00 + k, sub, f"{sub}", kind))
+        found.add_object(settings)
+        found.add_object(mapped)
+    return found
+
+
+@needs("canopen")
+def test_canopen_finds_an_encoder_and_sets_up_its_pdos(tmp_path: Path) -> None:
+    canopen: Any = importlib.import_module("canopen")
+    station = CanBusStation(CanBus())
+    station.add_member("host", PtyLink(tmp_path / "can"))
+    scene = Bench()
+    scene.drive_wheel(0, "left", 0.5)
+    station.bus.add_node("encoder", Cia406Encoder(scene, 0x20))
+    loop = Attachment()
+    loop.add_station("can", station)
+    with loop:
+        time.sleep(0.5)
+        network = canopen.Network()
+        network.connect(interface="slcan", channel=str(tmp_path / "can"), bitrate=1_000_000, sleep_after_open=0)
+        try:
+            network.scanner.search()
+            time.sleep(0.3)
+            assert network.scanner.nodes == [0x20]
+            kinds = {0x1000: ("device type", 7), 0x1008: ("name", 9), 0x1017: ("heartbeat", 6), 0x6004: ("position", 7)}
+            node = network.add_node(0x20, _described(kinds))
+            assert node.sdo[0x1000].raw & 0xFFFF == 406
+            assert node.sdo[0x1008].raw == "UMFELD SIM ENC"
+            node.sdo[0x1017].raw = 50
+            assert node.nmt.wait_for_heartbeat(2.0) == "PRE-OPERATIONAL"
+            node.tpdo.read()
+            heard: dict[int, list[int]] = {1: [], 2: []}
+            for number, kind in ((1, 254), (2, 1)):
+                pdo = node.tpdo[number]
+                pdo.clear()
+                pdo.add_variable(0x6004)
+                pdo.trans_type, pdo.enabled = kind, True
+                if number == 1:
+                    pdo.event_timer = 20
+                pdo.save()
+                pdo.add_callback(lambda found, values=heard[number]: values.append(found["position"].raw))
+            node.nmt.state = "OPERATIONAL"
+            network.sync.start(0.05)
+            time.sleep(1.0)
+            network.sync.stop()
+            assert len(heard[1]) == pytest.approx(50, abs=8)
+            assert len(heard[2]) == pytest.approx(20, abs=4)
+            assert heard[1] == sorted(heard[1])
+            assert heard[1][-1] > heard[1][0]
+        finally:
+            network.disconnect()
 
 
 def test_bridge_by_a_blocking_serial_client(tmp_path: Path) -> None:
