@@ -521,7 +521,7 @@ class Attachment:
         return self._serve_all(lambda: now_ns)
 
     def _serve_all(self, clock: Callable[[], int]) -> int | None:
-        """Each at its own time: one that measures a sweep for some milliseconds makes the next one's values no older."""
+        """Each at its own time: one that measures a sweep for milliseconds makes the next one's values no older."""
         while not self._posted.empty():
             self._posted.get()()
         due = [station.service(clock()) for station in self._stations.values()]
