@@ -77,6 +77,11 @@ class BoxCount:
     occupied: int
 
 
+_DENSE_RAYS: Final = 20_000  # fewer are walked one by one
+_FAR_LAYERS: Final = 12  # shorter rays are walked as fast as they are sorted
+_STRIDE: Final = 23  # so many rays of a dense tile for one that is walked from the origin: no divisor of usual widths
+
+
 class _Marks:
     """What an insertion under way says of the voxels of the bricks it touches."""
 
@@ -173,13 +178,29 @@ class Octree:
         self.rejected_points += kernels.place_rays(origin, points, self.resolution_m, range_max_m, hit, end, kind)
         marks = _Marks(self._touched_before)
         keep = self._lowest - kernels.UNIFORM
-        done, full = 0, False
-        while done < n:
-            done = kernels.mark_rays(
-                done, origin, self.resolution_m, end, kind, keep, full, *self._tree(), *marks.arrays(), self._path,
-                refused,
+        skip = np.zeros(n, dtype=np.int32)
+
+        def walk(order: I64) -> None:
+            done, full = 0, False
+            while done < len(order):
+                done = kernels.mark_rays(
+                    done, order, skip, origin, self.resolution_m, end, kind, keep, full, *self._tree(),
+                    *marks.arrays(), self._path, refused,
+                )  # fmt: skip
+                full = done < len(order) and not self._grow(marks)
+
+        tiles = self._tiles(origin, end, kind)
+        if tiles is None:
+            walk(np.arange(n, dtype=np.int64))
+        else:
+            order, first, layers = tiles
+            some, rest = kernels.some_and_rest(order, first, _STRIDE)
+            walk(some)
+            kernels.marked_layers(
+                order, first, layers, origin, self.resolution_m, keep, self._nodes, self._mark_of, marks.marks,
+                self._path, skip,
             )  # fmt: skip
-            full = done < n and not self._grow(marks)
+            walk(rest)
         done, full = 0, False
         while done < n:
             done = kernels.mark_hits(done, end, kind, full, *self._tree(), *marks.arrays(), self._path, refused)
@@ -189,6 +210,19 @@ class Octree:
         kernels.settle(
             self._hit, self._miss, self._lowest, self._highest, *self._tree(), marks.touched, marks.marks, self._path
         )
+
+    def _tiles(self, origin: F64, end: F64, kind: U8) -> tuple[I64, I64, I32] | None:
+        """Rays in the order of tiles, where those begin, and layers, as kernels have them; None if the cloud is not
+        from one place, or not dense enough for it."""
+        n = len(end)
+        if len(origin) > 1 or n < _DENSE_RAYS:
+            return None
+        tile, layers = np.empty(n, dtype=np.int32), np.zeros(n, dtype=np.int32)
+        kernels.tiles_of_rays(origin, self.resolution_m, end, kind, tile, layers)
+        order, first = kernels.order_of_tiles(tile)
+        used = np.count_nonzero(np.diff(first))
+        dense = len(order) >= kernels.TILE_LEAST * used and int(layers.sum()) >= _FAR_LAYERS * len(order)
+        return (order, first, layers) if dense else None
 
     def _tree(self) -> tuple[I32, I8, I32, I32, I32, I32, I64]:
         return (

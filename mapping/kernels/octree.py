@@ -12,6 +12,10 @@ level l chooses a child by bit l of the brick's coordinates.
     marks     (T * 512,) uint8  what this insertion says of each voxel: 0 nothing, FREE, HIT; all 0 between insertions
     state     (5,) int64     see below; free_nodes, free_bricks: stacks of what was given back
 
+Of a dense cloud from one place (a depth image) nearly all voxels that a ray passes have a mark already. So rays are
+told apart by tiles of directions; some of each tile are walked, then it is looked how far the whole pyramid over a tile
+is marked, and the others begin there. What is marked in the end is the same, voxel by voxel.
+
 Coordinates are in voxels, from 0 to SIDE; the caller has moved the origin to the middle.
 """
 
@@ -42,6 +46,9 @@ BRICKS_BACK = 3
 TOUCHED = 4
 STATE_LENGTH = 5
 
+TILES = 96  # along an edge of the cube of directions
+TILE_LEAST = 32  # rays of a tile, for it to be looked at as a whole
+TILE_MARGIN = 1e-6  # voxels: what rounding may move a ray
 SHORTCUTS = 1 << 13
 PATH_LENGTH = LEVELS + 4  # nodes from the brick's parent up, then x, y, z of the brick, then the lowest valid level
 _X, _Y, _Z, _LOW = LEVELS, LEVELS + 1, LEVELS + 2, LEVELS + 3
@@ -218,43 +225,168 @@ def voxel_at(t: float, ties: bool, v0: float, way: float, per: float, step: Any,
 
 
 @njit(cache=True, nogil=True)
+def tiles_of_rays(origin: Any, resolution: float, end: Any, kind: Any, tile: Any, layers: Any) -> None:
+    """Rays from one origin (1, 3) by direction: tile (N,) int32, -1 for those that say nothing.
+
+    A tile is a square of TILES x TILES on a face of a cube around the origin: all its rays have the same major axis,
+    the one along which they go farthest, and none is outside of the pyramid over it.
+    layers: (N,) int32, layers of voxels across the major axis from the origin's to that of the end.
+    """
+    half = float(SIDE // 2)
+    x0, y0, z0 = origin[0, 0] / resolution + half, origin[0, 1] / resolution + half, origin[0, 2] / resolution + half
+    x, y, z = np.int64(x0), np.int64(y0), np.int64(z0)
+    for i in range(end.shape[0]):
+        tile[i] = -1
+        if kind[i] == 0:
+            continue
+        dx, dy, dz = end[i, 0] - x0, end[i, 1] - y0, end[i, 2] - z0
+        if abs(dx) >= abs(dy) and abs(dx) >= abs(dz):
+            major, along, u, v = 0, dx, dy, dz
+            layers[i] = abs(np.int64(end[i, 0]) - x)
+        elif abs(dy) >= abs(dz):
+            major, along, u, v = 1, dy, dz, dx
+            layers[i] = abs(np.int64(end[i, 1]) - y)
+        else:
+            major, along, u, v = 2, dz, dx, dy
+            layers[i] = abs(np.int64(end[i, 2]) - z)
+        if along == 0.0:
+            continue
+        to_tiles = 0.5 * TILES / abs(along)
+        at_u: Any = min(max(np.int64(u * to_tiles + 0.5 * TILES), 0), TILES - 1)
+        at_v: Any = min(max(np.int64(v * to_tiles + 0.5 * TILES), 0), TILES - 1)
+        tile[i] = ((2 * major + (1 if along > 0.0 else 0)) * TILES + at_v) * TILES + at_u
+
+
+@njit(cache=True, nogil=True)
+def order_of_tiles(tile: Any) -> Any:
+    """(order, first): rays of tile t are order[first[t]: first[t + 1]], in their order; those of none are left out."""
+    first = np.zeros(6 * TILES * TILES + 1, np.int64)
+    for i in range(tile.size):
+        if tile[i] >= 0:
+            first[tile[i] + 1] += 1
+    for t in range(first.size - 1):
+        first[t + 1] += first[t]
+    fill, order = first[:-1].copy(), np.empty(first[-1], np.int64)
+    for i in range(tile.size):
+        t = tile[i]
+        if t >= 0:
+            order[fill[t]] = i
+            fill[t] += 1
+    return order, first
+
+
+@njit(cache=True, nogil=True)
+def some_and_rest(order: Any, first: Any, stride: int) -> Any:
+    """Every stride-th ray of each tile, all of those of less than TILE_LEAST; and the rest, in the order of the cloud,
+    in which ends and points lie in memory."""
+    chosen = np.empty(order.size, np.int64)
+    is_rest = np.zeros(0 if order.size == 0 else order.max() + 1, np.bool_)
+    count = 0
+    for t in range(first.size - 1):
+        size = first[t + 1] - first[t]
+        for k in range(size):
+            i = order[first[t] + k]
+            if size < TILE_LEAST or k % stride == 0:
+                chosen[count] = i
+                count += 1
+            else:
+                is_rest[i] = True
+    return chosen[:count], np.flatnonzero(is_rest)
+
+
+@njit(cache=True, nogil=True)
+def marked_layers(
+    order: Any, first: Any, layers: Any, origin: Any, resolution: float, keep: Any, nodes: Any, mark_of: Any,
+    marks: Any, path: Any, skip: Any,
+) -> None:  # fmt: skip
+    """How far the rays of a tile need not be walked: skip (N,) int32 becomes layers << 2 | major axis.
+
+    Layer by layer from the origin on, as long as every voxel that the tile's pyramid touches there has a mark (or is
+    within a region of entry `keep`): then so has every voxel of each of its rays. No farther than the layer in which
+    the first of them ends. Tiles of less than TILE_LEAST rays are left alone.
+    """
+    reset_path(path)
+    half = float(SIDE // 2)
+    start, low, high = np.empty(3), np.empty(3, np.int64), np.empty(3, np.int64)
+    for axis in range(3):
+        start[axis] = origin[0, axis] / resolution + half
+    known_x, known_y, known_z, place = np.int64(-1), np.int64(-1), np.int64(-1), np.int64(-1)
+    for t in range(first.size - 1):
+        if first[t + 1] - first[t] < TILE_LEAST:
+            continue
+        major, up = t // (TILES * TILES) // 2, t // (TILES * TILES) % 2
+        a, b = (major + 1) % 3, (major + 2) % 3
+        u, v = (t % TILES) * (2.0 / TILES) - 1.0, (t // TILES % TILES) * (2.0 / TILES) - 1.0
+        most = np.int64(SIDE)
+        for k in range(first[t], first[t + 1]):
+            most = min(most, np.int64(layers[order[k]]))
+        done: Any = np.int64(0)
+        own = np.int64(start[major])
+        while done < most:
+            layer = own + done if up else own - done
+            near = 0.0 if done == 0 else (layer - start[major] if up else start[major] - (layer + 1))
+            far = layer + 1 - start[major] if up else start[major] - layer
+            for axis, edge in ((a, u), (b, v)):
+                other = edge + 2.0 / TILES
+                low[axis] = np.int64(math.floor(start[axis] + min(edge * near, edge * far) - TILE_MARGIN))
+                high[axis] = np.int64(math.floor(start[axis] + max(other * near, other * far) + TILE_MARGIN))
+            low[major], high[major] = layer, layer
+            whole = min(low[0], min(low[1], low[2])) >= 0 and max(high[0], max(high[1], high[2])) < SIDE
+            z = low[2]
+            while whole and z <= high[2]:
+                y = low[1]
+                while whole and y <= high[1]:
+                    x = low[0]
+                    while whole and x <= high[0]:
+                        bx, by, bz = x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS
+                        if bx != known_x or by != known_y or bz != known_z:
+                            known_x, known_y, known_z = bx, by, bz
+                            entry = find_entry(bx, by, bz, nodes, path)
+                            place = np.int64(mark_of[entry]) if entry > 0 else np.int64(-2 if entry == keep else -1)
+                        if place >= 0:
+                            at = np.uint64(place * BRICK_VOXELS + ((z & 7) << 6 | (y & 7) << 3 | (x & 7)))
+                            whole = marks[at] != 0
+                        else:
+                            whole = place == -2
+                        x += 1
+                    y += 1
+                z += 1
+            if not whole:
+                break
+            done += 1
+        for k in range(first[t], first[t + 1]):
+            skip[order[k]] = done << 2 | major
+
+
+@njit(cache=True, nogil=True)
 def mark_rays(
-    begin: int, origin: Any, resolution: float, end: Any, kind: Any, keep: Any, refuse: bool, nodes: Any, bricks: Any,
-    brick_at: Any, mark_of: Any, free_nodes: Any, free_bricks: Any, state: Any, touched: Any, left: Any, marks: Any,
-    shortcuts: Any, path: Any, refused: Any,
+    begin: int, order: Any, skip: Any, origin: Any, resolution: float, end: Any, kind: Any, keep: Any, refuse: bool,
+    nodes: Any, bricks: Any, brick_at: Any, mark_of: Any, free_nodes: Any, free_bricks: Any, state: Any, touched: Any,
+    left: Any, marks: Any, shortcuts: Any, path: Any, refused: Any,
 ) -> int:  # fmt: skip
-    """Mark as FREE the voxels from origin up to, without, the one of end[i], for i from begin on [AW87].
+    """Mark as FREE the voxels from origin up to, without, the one of end[i], for i of order (M,) from begin on [AW87].
 
     The walk goes from brick to brick, and from voxel to voxel where a brick has voxels without a mark: with many
     points a scan those are few.  left: (T,) int32, voxels without a mark of each touched brick.
-    keep: the entry that more free evidence does not change: such regions are passed, too.
-    Returns i when there is no room for the next ray, N at the end. refuse: pass such a ray over, refused[i] = 1.
+    keep: the entry that more free evidence does not change: such regions are passed, too.  skip: (N,) as
+    `marked_layers` has it, what need not be walked; 0 is all from the origin on.
+    Returns k when there is no room for ray order[k], M at the end. refuse: pass such a ray over, refused[i] = 1.
     No axis takes more steps than there are borders between the two ends, so rounding cannot make a walk run past.
     """
     reset_path(path)
     half = float(SIDE // 2)
     budget: Any = np.int64(0)
-    for i in range(begin, end.shape[0]):
+    x0, y0, z0 = origin[0, 0] / resolution + half, origin[0, 1] / resolution + half, origin[0, 2] / resolution + half
+    for k in range(begin, order.size):
+        i = np.uint64(order[k])
         if kind[i] == 0:
             continue
-        o = min(i, origin.shape[0] - 1)
-        x0, y0, z0 = (
-            origin[o, 0] / resolution + half,
-            origin[o, 1] / resolution + half,
-            origin[o, 2] / resolution + half,
-        )
+        if origin.shape[0] > 1:
+            x0 = origin[i, 0] / resolution + half
+            y0 = origin[i, 1] / resolution + half
+            z0 = origin[i, 2] / resolution + half
         x, y, z = np.int64(x0), np.int64(y0), np.int64(z0)
         x1, y1, z1 = np.int64(end[i, 0]), np.int64(end[i, 1]), np.int64(end[i, 2])
-        bx, by, bz = x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS
-        bx1, by1, bz1 = x1 >> BRICK_BITS, y1 >> BRICK_BITS, z1 >> BRICK_BITS
-        wanted = abs(bx1 - bx) + abs(by1 - by) + abs(bz1 - bz) + 1
-        if wanted > budget:
-            budget = np.int64(room_left(nodes, brick_at, touched, state))
-            if wanted > budget:
-                if not refuse:
-                    return i
-                refused[i] = 1
-                continue
         # Border k along an axis is passed at (k - x0) * per_x of the way.
         way_x, way_y, way_z = end[i, 0] - x0, end[i, 1] - y0, end[i, 2] - z0
         per_x = 1.0 / way_x if x1 != x else np.inf
@@ -262,6 +394,33 @@ def mark_rays(
         per_z = 1.0 / way_z if z1 != z else np.inf
         sx, sy, sz = np.int64(1 if x1 >= x else -1), np.int64(1 if y1 >= y else -1), np.int64(1 if z1 >= z else -1)
         ax, ay, az = np.int64(1 if x1 >= x else 0), np.int64(1 if y1 >= y else 0), np.int64(1 if z1 >= z else 0)
+        if skip[i] >> 2:  # as if it had come so far, in the order of borders that the walk has
+            layer, major = np.int64(skip[i] >> 2), skip[i] & 3
+            if major == 0:
+                x += sx * layer
+                t = (x + 1 - ax - x0) * per_x
+                y = voxel_at(t, True, y0, way_y, per_y, sy, y, y1)
+                z = voxel_at(t, True, z0, way_z, per_z, sz, z, z1)
+            elif major == 1:
+                y += sy * layer
+                t = (y + 1 - ay - y0) * per_y
+                x = voxel_at(t, False, x0, way_x, per_x, sx, x, x1)
+                z = voxel_at(t, True, z0, way_z, per_z, sz, z, z1)
+            else:
+                z += sz * layer
+                t = (z + 1 - az - z0) * per_z
+                x = voxel_at(t, False, x0, way_x, per_x, sx, x, x1)
+                y = voxel_at(t, False, y0, way_y, per_y, sy, y, y1)
+        bx, by, bz = x >> BRICK_BITS, y >> BRICK_BITS, z >> BRICK_BITS
+        bx1, by1, bz1 = x1 >> BRICK_BITS, y1 >> BRICK_BITS, z1 >> BRICK_BITS
+        wanted = abs(bx1 - bx) + abs(by1 - by) + abs(bz1 - bz) + 1
+        if wanted > budget:
+            budget = np.int64(room_left(nodes, brick_at, touched, state))
+            if wanted > budget:
+                if not refuse:
+                    return k
+                refused[i] = 1
+                continue
         brick_x = (((bx + ax) << BRICK_BITS) - x0) * per_x if bx != bx1 else np.inf
         brick_y = (((by + ay) << BRICK_BITS) - y0) * per_y if by != by1 else np.inf
         brick_z = (((bz + az) << BRICK_BITS) - z0) * per_z if bz != bz1 else np.inf
@@ -335,7 +494,7 @@ def mark_rays(
                 brick_z = (((bz + az) << BRICK_BITS) - z0) * per_z if bz != bz1 else np.inf
             else:
                 break
-    return int(end.shape[0])
+    return int(order.size)
 
 
 @njit(cache=True, nogil=True)

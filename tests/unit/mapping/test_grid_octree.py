@@ -6,6 +6,7 @@ import math
 import struct
 import zlib
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +16,10 @@ from numpy.typing import NDArray
 
 from mapping.grids.evidence import FREE, OCCUPIED, PARTLY_FREE, UNKNOWN
 from mapping.grids.octree import HALF, HEADER, Octree, VoxelRules
+from mapping.kernels import octree as kernels
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 Voxel = tuple[int, int, int]
 D = 0.1
 HIT, MISS, LOWEST, HIGHEST = 17, -8, -40, 70  # steps of 0.05, of the rules' defaults
@@ -417,3 +420,45 @@ def test_bytes_that_lie_about_their_size_are_refused() -> None:
     newer = good[:4] + struct.pack("<B", 2) + good[5:]
     with pytest.raises(ValueError, match="version 2"):
         Octree.from_bytes(newer)
+
+
+def depth_image(columns: int, rows: int, origin: tuple[float, float, float], seed: int) -> F64:
+    """Points of a camera's pixels, row by row: a wall with steps and a slope, and some pixels that see far."""
+    rng = np.random.default_rng(seed)
+    u, v = np.meshgrid(np.linspace(-0.6, 0.6, columns), np.linspace(-0.45, 0.45, rows))
+    depth = 1.5 + 0.6 * (u > 0.1) + 0.3 * v + rng.choice([0.0, 1.5], u.shape, p=(0.99, 0.01))
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]) if seed % 2 else np.eye(3)
+    return np.asarray(origin + (np.stack((np.ones_like(u), u, v), axis=-1) * depth[..., None]).reshape(-1, 3) @ turn.T)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.013, -0.377, 0.21), (0.05, 0.05, 0.025)])
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("resolution_m", [0.05, 0.11])
+def test_a_dense_cloud_is_inserted_as_if_each_ray_was_walked(
+    origin: tuple[float, float, float], seed: int, resolution_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tiles of directions only save work: the same bytes, also on top of what is known and with a bound on ranges."""
+    trees = []
+    for dense_rays in (20_000, 10**9):
+        monkeypatch.setattr("mapping.grids.octree._DENSE_RAYS", dense_rays)
+        tree = Octree(resolution_m=resolution_m)
+        for number, range_max_m in ((seed, math.inf), (seed + 2, 1.7), (seed, math.inf)):
+            tree.insert(origin, depth_image(300, 200, origin, number), range_max_m=range_max_m)
+        trees.append(tree)
+    assert trees[0].to_bytes() == trees[1].to_bytes()
+    assert trees[0].leaf_count() > 1000
+
+
+def test_most_rays_of_a_depth_image_begin_near_their_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else tiles save nothing."""
+    skipped: list[float] = []
+    walk = kernels.mark_rays
+
+    def noted(begin: int, order: I64, skip: I64, *rest: Any) -> int:
+        skipped.append(float(np.mean(skip[order] >> 2)))
+        return int(walk(begin, order, skip, *rest))
+
+    monkeypatch.setattr(kernels, "mark_rays", noted)
+    Octree(resolution_m=0.05).insert((0.0, 0.0, 0.0), depth_image(640, 480, (0.0, 0.0, 0.0), 2))
+    assert skipped[0] == 0.0
+    assert skipped[-1] > 20.0  # of 30 to 42 layers
