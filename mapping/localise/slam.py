@@ -64,6 +64,8 @@ WORTH_ANOTHER_PASS = 3  # closures gained in one
 PLACED_EXPLAINED = 0.6
 PLACED_OVERLAP = 0.85  # doors and chairs were moved since
 CLEARLY = 1.1  # times better a match must be to be believed against the prediction
+CLEARLY_PER_DEVIATION = 0.04  # and so much more for each deviation beyond the gate
+MOST_BEYOND = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,12 +439,18 @@ class Slam:
         pull = guess.information() / (1.0 - doubt) ** 4  # leaves that move and crowds look like many points
         held = match_view(view, store, rows, poses, guess.map_from_sensor, prior=pull, reach=NEARBY)
         best = held
-        if match is not None and (held is None or match.score > CLEARLY * held.score):
+        if match is not None and (held is None or match.score > self._clearly(guess, match) * held.score):
             best = match
         fits = 0.0 if best is None else agreement(view, store, rows, poses, best.pose).explained
         if fits < 0.5:
             best, fits = self._looked_around(view, rows, guess, best, fits)
         return best if fits >= LEAST_FIT else None
+
+    def _clearly(self, guess: _Place, match: Match) -> float:
+        """How much better than what the prediction holds a match must fit to be believed: the more, the farther it
+        leads from a prediction that has been right so far."""
+        beyond = max(0.0, max(guess.deviations(match.pose)) - self.settings.gate)
+        return CLEARLY + CLEARLY_PER_DEVIATION * min(beyond, MOST_BEYOND)
 
     def _looked_around(
         self, view: View, rows: I64, guess: _Place, best: Match | None, fits: float
@@ -457,7 +465,7 @@ class Slam:
         if spot is None or spot.rival > 0.97:
             return best, fits
         other = match_view(view, store, rows, poses, spot.pose, reach=NEARBY)
-        if other is None:
+        if other is None or (best is not None and other.score < self._clearly(guess, other) * best.score):
             return best, fits
         found = agreement(view, store, rows, poses, other.pose).explained
         return (other, found) if found > fits + 0.1 else (best, fits)
