@@ -7,6 +7,9 @@ by more than TOLERANCE_M was or will be drawn, with the tiles around them, and d
 before the first scan that is older than a delay that stamps and counts alone decide, in one go: subscribers see the
 map before or after, never a mixture. What was kept meanwhile is drawn on top. Tiles nobody moved stay as they are.
 
+Of a place that is seen often, the oldest of what was kept is given up in time (KeptPlaces): a robot that drives the
+same rooms for days keeps no more than after some laps. What is drawn already stays drawn.
+
 What is drawn around the robot (FollowsCorrections) moves at once, as the robot's pose does.
 """
 
@@ -24,6 +27,7 @@ from numpy.typing import NDArray
 from mapping.frames import Pose2, wrap_angles
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.tiles import TILE
+from mapping.localise.kept_places import KeptPlaces, profile_of
 from mapping.localise.kept_sweeps import KeptSweep, kept_sweep, shifts_m
 from mapping.localise.pose_graph import composed_poses
 from mapping.scan import Scan
@@ -45,6 +49,7 @@ TOLERANCE_M = 0.015
 DELAY_NS = 500_000_000
 DELAY_NS_PER_KEPT = 2_000_000  # about ten times what one takes to draw thrice
 TOUCH_REACH_M = 3.0  # a switch sits on the robot
+GIVE_UP_AT_ONCE = 64  # so many may go before anything does: the rest is moved together each time
 RECENT = 40  # kept sweeps that make up what is around the robot
 
 
@@ -144,6 +149,9 @@ class Redrawer:
         self._mounts = {name: np.array([p.x_m, p.y_m, p.yaw_rad]) for name, p in mounts.items()}
         self._submit = submit
         self._kept: list[Kept] = []
+        self._serial: list[int] = []  # of what is kept: rises
+        self._places = KeptPlaces()
+        self._gone: set[int] = set()  # serials that go as soon as no job sees them
         self._key: NDArray[np.int64] = np.zeros(64, dtype=np.int64)
         self._in_key: F64 = np.zeros((64, 2, 3))
         self._drawn: F64 = np.zeros((64, 2, 3))
@@ -153,7 +161,7 @@ class Redrawer:
         self._under_way: _UnderWay | None = None
         self._base: dict[Place, bytes] = {}
         self.on_redrawn: OnRedrawn = _ignore
-        self.counts = {"map.redrawn": 0, "map.redraw_errors": 0}
+        self.counts = {"map.redrawn": 0, "map.redraw_errors": 0, "map.given_up_sweeps": 0}
 
     # --- keeping
 
@@ -191,6 +199,30 @@ class Redrawer:
             self._reach = np.concatenate((self._reach, np.zeros_like(self._reach)))
         self._key[n], self._in_key[n], self._drawn[n], self._reach[n] = kept.key, kept.in_key, ends, kept.reach_m
         self._kept.append(kept)
+        serial = self._serial[-1] + 1 if self._serial else 0
+        self._serial.append(serial)
+        self._gone.update(self._places.add(serial, _name(kept), ends[0], self._profile(kept, ends[0])))
+        if len(self._gone) >= GIVE_UP_AT_ONCE:
+            self._give_up()
+
+    def _profile(self, kept: Kept, pose: F64) -> NDArray[np.float32] | None:
+        if not isinstance(kept, KeptSweep):
+            return None
+        scan = kept.scan()
+        return profile_of(scan.bearing_rad, scan.range_m, float(pose[2] + self._mounts[kept.sensor][2]))
+
+    def _give_up(self) -> None:
+        """Forget what may go, unless a job is under way, which counts by place in the list."""
+        if self._under_way is not None or not self._gone:
+            return
+        stays = np.array([serial not in self._gone for serial in self._serial])
+        n = int(stays.sum())
+        for array in (self._key, self._in_key, self._drawn, self._reach):
+            array[:n] = array[: len(stays)][stays]
+        self._kept = [kept for kept, here in zip(self._kept, stays) if here]
+        self._serial = [serial for serial, here in zip(self._serial, stays) if here]
+        self.counts["map.given_up_sweeps"] += len(self._gone)
+        self._gone.clear()
 
     def keep_touch(self, source: str, touch: Touch, key: int, key_pose: Pose2, map_from_base: Pose2) -> None:
         """The same for a switch that is tripped."""
@@ -201,6 +233,8 @@ class Redrawer:
     def start_over(self, base: Iterable[tuple[int, int, bytes]] = ()) -> None:
         """Forget what was kept; base: tiles of the map that is there now."""
         self._kept, self._under_way = [], None
+        self._serial, self._places = [], KeptPlaces()
+        self._gone.clear()
         self._last.clear()
         self._base = {(row, col): payload for row, col, payload in base}
 
@@ -251,6 +285,8 @@ class Redrawer:
             log.exception("internal error while drawing the map again")
             return
         self._drawn[: len(job.kept)][job.moved] = job.now[job.moved]
+        moved = np.flatnonzero(job.moved)
+        self._places.move([self._serial[k] for k in moved.tolist()], job.now[moved, 0])
         for index in range(len(job.kept), len(self._kept)):
             if self._kept[index].sensor in job.sources:
                 draw(redrawn.grid, self._kept[index], self._drawn[index], self._mounts)
@@ -271,6 +307,7 @@ class Redrawer:
     def _begin(self, stamp_ns: int, key_poses: F64) -> None:
         if self._under_way is not None or self._building is None or not self._kept:
             return
+        self._give_up()
         n = len(self._kept)
         drawn = self._drawn[:n].copy()
         now = self._poses_now(key_poses, slice(0, n))
@@ -348,6 +385,15 @@ def _may_reach(ends: F64, reach_m: float, places: set[Place], resolution_m: floa
 def _seen_from(key_pose: Pose2, ends: F64) -> F64:
     inverse = key_pose.inverse()
     return composed_poses(np.array([inverse.x_m, inverse.y_m, inverse.yaw_rad]), ends)
+
+
+def _name(kept: Kept) -> str:
+    """What may stand for what: a laser's sweeps for each other, rounds of the same transducers."""
+    if isinstance(kept, KeptSweep):
+        return kept.sensor
+    if isinstance(kept.heard, Round):
+        return f"{kept.sensor}/{sorted(cone.channel for cone in kept.heard.cones)}"
+    return f"{kept.sensor}/{kept.heard.switch.line}"
 
 
 def _ignore(_: Sequence[Callable[[], Sweep]]) -> None:

@@ -2,9 +2,9 @@
 
     rows of corridors along x at `rows_m`, columns along y at `columns_m`; both as crossings name them: (column, row)
 
-A corridor is two walls with a door every few metres: a shallow niche, or an open door with a bare room behind. A part of
-the walls is glass, here and there stands a bin or a bench. Crossings are as wide as the corridors, or lobbies. What a
-robot sees between two crossings hardly differs from one corridor to the next: that is the point of it.
+A corridor is two walls with a door every few metres: a shallow niche, or an open door with a bare room behind. A part
+of the walls is glass, here and there stands a bin or a bench. Crossings are as wide as the corridors, or lobbies. What
+a robot sees between two crossings hardly differs from one corridor to the next: that is the point of it.
 """
 
 from __future__ import annotations
@@ -67,7 +67,9 @@ class _Draft:
             self._crossing(crossing, {side for at, side in open_sides if at == crossing})
         for a, b in sorted(pairs):
             self._corridor(a, b)
-        return FloorPlan("big building", tuple(self._walls), (), tuple(self._boxes), (), tuple(self._circles), route=self._route())
+        return FloorPlan(
+            "big building", tuple(self._walls), (), tuple(self._boxes), (), tuple(self._circles), route=self._route()
+        )
 
     def _legs(self) -> list[tuple[Crossing, Crossing]]:
         """Neighbouring crossings along the tour."""
@@ -77,7 +79,10 @@ class _Draft:
                 raise ValueError(f"no corridor leads from {(ca, ra)} to {(cb, rb)}")
             steps = max(abs(cb - ca), abs(rb - ra))
             step = (int(np.sign(cb - ca)), int(np.sign(rb - ra)))
-            legs += [((ca + k * step[0], ra + k * step[1]), (ca + (k + 1) * step[0], ra + (k + 1) * step[1])) for k in range(steps)]
+            legs += [
+                ((ca + k * step[0], ra + k * step[1]), (ca + (k + 1) * step[0], ra + (k + 1) * step[1]))
+                for k in range(steps)
+            ]
         return legs
 
     def _place(self, crossing: Crossing) -> Point:
@@ -131,7 +136,10 @@ class _Draft:
     def _room(self, at: PlaceAt, door: float) -> None:
         """A bare room behind an open door."""
         depth, wide = float(self._rng.uniform(3.0, 5.0)), float(self._rng.uniform(0.3, 0.8))
-        self._walls.append(Wall((at(door), at(door, 0.12), at(door - wide, 0.12), at(door - wide, depth), at(door + DOOR_M + wide, depth), at(door + DOOR_M + wide, 0.12), at(door + DOOR_M, 0.12), at(door + DOOR_M)), 0.0))  # fmt: skip
+        left, right, thick = door - wide, door + DOOR_M + wide, NICHE_M
+        near = (at(door), at(door, thick), at(left, thick), at(left, depth))
+        far = (at(right, depth), at(right, thick), at(door + DOOR_M, thick), at(door + DOOR_M))
+        self._walls.append(Wall((*near, *far), 0.0))
 
     def _clutter(self, at: PlaceAt, t: float) -> None:
         """Seldom a bin or a bench by the wall."""

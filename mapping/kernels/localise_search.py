@@ -71,18 +71,41 @@ def score_at(raster: Any, cx: Any, cy: Any, dx: int, dy: int) -> int:
 
 
 @njit(cache=True, nogil=True)
+def pool_again(pooled: Any, block: int, times: int) -> Any:
+    """Maxima over times * block cells each way, from a copy pooled over `block` cells."""
+    height, width = pooled.shape
+    wide = np.zeros_like(pooled)
+    for v in range(height):
+        for u in range(width):
+            best = pooled[v, u]
+            for k in range(1, times):
+                if u + k * block < width:
+                    best = max(best, pooled[v, u + k * block])
+            wide[v, u] = best
+    out = np.zeros_like(pooled)
+    for v in range(height):
+        for k in range(times):
+            if v + k * block < height:
+                for u in range(width):
+                    out[v, u] = max(out[v, u], wide[v + k * block, u])
+    return out
+
+
+@njit(cache=True, nogil=True)
 def search(
-    fine: Any, pooled: Any, block: int, x0: float, y0: float, resolution_m: float, px: Any, py: Any, guess: Any,
-    window_m: float, turn_rad: float, turn_step_rad: float, apart_m: float, apart_rad: float, floor_share: float,
-    result: Any,
+    fine: Any, pooled: Any, block: int, top: Any, top_block: int, x0: float, y0: float, resolution_m: float, px: Any,
+    py: Any, guess: Any, window_m: float, turn_rad: float, turn_step_rad: float, apart_m: float, apart_rad: float,
+    floor_share: float, any_rival: bool, result: Any,
 ) -> None:  # fmt: skip
     """Best pose of points (M,) around a guess (3,), and the best of those that lie apart from it.
 
+    pooled, top: maxima over block and top_block cells, a multiple (the same raster if it is 1).  any_rival: the first
+    that reaches floor_share will do.
     result: (5,) x, y, yaw of the best, its score, and the score of the best that is apart_m or apart_rad away (0 if
     none reaches floor_share of the best's); scores are mean likelihoods in [0, 1].
     """
     turns = int(turn_rad / turn_step_rad)
-    blocks = math.ceil(window_m / (resolution_m * block))
+    blocks = math.ceil(window_m / (resolution_m * top_block))
     side = 2 * blocks + 1
     total = (2 * turns + 1) * side * side
     bounds = np.empty(total, dtype=np.int64)
@@ -100,39 +123,48 @@ def search(
             cells_y[t, i] = math.floor((guess[1] + s * px[i] + c * py[i] - y0) / resolution_m)
         for by in range(-blocks, blocks + 1):
             for bx in range(-blocks, blocks + 1):
-                bounds[at] = score_at(pooled, cells_x[t], cells_y[t], bx * block, by * block)
+                bounds[at] = score_at(top, cells_x[t], cells_y[t], bx * top_block, by * top_block)
                 at += 1
     order = np.argsort(-bounds, kind="mergesort")
+    ratio = top_block // block
     best, best_t, best_x, best_y = -1, 0, 0, 0
     for n in range(total):
         k = order[n]
         if bounds[k] <= best:
             break
         t = k // (side * side)
-        by, bx = (k % (side * side)) // side - blocks, k % side - blocks
-        for dy in range(by * block, by * block + block):
-            for dx in range(bx * block, bx * block + block):
-                score = score_at(fine, cells_x[t], cells_y[t], dx, dy)
-                if score > best:
-                    best, best_t, best_x, best_y = score, t, dx, dy
+        by, bx = ((k % (side * side)) // side - blocks) * top_block, (k % side - blocks) * top_block
+        for part in range(ratio * ratio):
+            my, mx = by + (part // ratio) * block, bx + (part % ratio) * block
+            if ratio > 1 and score_at(pooled, cells_x[t], cells_y[t], mx, my) <= best:
+                continue
+            for dy in range(my, my + block):
+                for dx in range(mx, mx + block):
+                    score = score_at(fine, cells_x[t], cells_y[t], dx, dy)
+                    if score > best:
+                        best, best_t, best_x, best_y = score, t, dx, dy
     second = int(floor_share * best)
     found = False
     apart_cells = apart_m / resolution_m
     for n in range(total):
         k = order[n]
-        if bounds[k] <= second:
+        if bounds[k] <= second or (found and any_rival):
             break
         t = k // (side * side)
-        by, bx = (k % (side * side)) // side - blocks, k % side - blocks
+        by, bx = ((k % (side * side)) // side - blocks) * top_block, (k % side - blocks) * top_block
         turned = abs(t - best_t) * turn_step_rad > apart_rad
-        for dy in range(by * block, by * block + block):
-            for dx in range(bx * block, bx * block + block):
-                if not turned and (dx - best_x) ** 2 + (dy - best_y) ** 2 < apart_cells * apart_cells:
-                    continue
-                score = score_at(fine, cells_x[t], cells_y[t], dx, dy)
-                if score > second:
-                    second = score
-                    found = True
+        for part in range(ratio * ratio):
+            my, mx = by + (part // ratio) * block, bx + (part % ratio) * block
+            if ratio > 1 and score_at(pooled, cells_x[t], cells_y[t], mx, my) <= second:
+                continue
+            for dy in range(my, my + block):
+                for dx in range(mx, mx + block):
+                    if not turned and (dx - best_x) ** 2 + (dy - best_y) ** 2 < apart_cells * apart_cells:
+                        continue
+                    score = score_at(fine, cells_x[t], cells_y[t], dx, dy)
+                    if score > second:
+                        second = score
+                        found = True
     scale = 1.0 / (255.0 * max(1, count))
     result[0] = guess[0] + best_x * resolution_m
     result[1] = guess[1] + best_y * resolution_m

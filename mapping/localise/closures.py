@@ -62,7 +62,7 @@ class ClosureSettings:
     apart_m: float = 8.0
     drift_m: float = 0.6
     drift_share: float = 0.05
-    search_m: float = 20.0
+    search_m: float = 40.0
     tracked_m: float = 1.0
     turn_start_rad: float = math.radians(6.0)
     turn_rad_per_m: float = math.radians(0.15)
@@ -216,7 +216,7 @@ class Work:
             for place in near:
                 tracked += self._track(key, place)
             # Where the search is wide, it is made more rarely: its cost grows with the square.
-            every_m = max(self.settings.every_m, *(0.15 * self._drift(way_m[row][place]) for place in wide), 0.0)
+            every_m = max(self.settings.every_m, *(0.05 * self._drift(way_m[row][place]) for place in wide), 0.0)
             may_search = self._events["searches"] < self.settings.searches
             if wide and may_search and self.snapshot.travel_m[key] - last_search_m >= every_m:
                 last_search_m = float(self.snapshot.travel_m[key])
@@ -256,22 +256,34 @@ class Work:
         drift = self._drift(way_m[earlier])
         facing = distance + 1.0 - np.cos(off[:, 2])  # of places equally near, the one seen from the same side
         trackable = (drift <= s.tracked_m) & (distance < 2.0)
-        near = self._spread(earlier[trackable], facing[trackable], s.place_m * 2.0, 2)
+        near = self._spread(earlier[trackable], facing[trackable], np.full(len(earlier), 2.0 * s.place_m), 2)
         if near:
             return near, []
         wide = (drift > s.tracked_m) & (distance < drift + 2.0)
-        return [], self._spread(earlier[wide], (facing / drift)[wide], s.place_m * 2.0, s.places)
+        apart_m = np.maximum(2.0 * s.place_m, self._reach_m(drift[wide]))
+        return [], self._spread(earlier[wide], (facing / drift)[wide], apart_m, s.places)
 
-    def _spread(self, keys: I64, cost: F64, apart_m: float, most: int) -> list[int]:
-        """The cheapest keys that lie apart along the way."""
+    def _reach_m(self, drift: F64) -> F64:
+        """How much of the way on either side of a key makes a place, where so much is to be searched; any shape."""
+        return np.maximum(self.settings.place_m, 0.5 * np.asarray(drift))
+
+    def _spread(self, keys: I64, cost: F64, apart_m: F64, most: int) -> list[int]:
+        """The cheapest keys that lie apart along the way: of each, apart_m (K,) from those chosen before."""
         travel = self.snapshot.travel_m
         chosen: list[int] = []
-        for key in keys[np.argsort(cost, kind="stable")].tolist():
-            if all(abs(travel[key] - travel[other]) >= apart_m for other in chosen):
+        for index in np.argsort(cost, kind="stable").tolist():
+            key = int(keys[index])
+            if all(abs(travel[key] - travel[other]) >= apart_m[index] for other in chosen):
                 chosen.append(key)
                 if len(chosen) == most:
                     break
         return chosen
+
+    def _nearest(self, place: int, key: int, reach_m: float, pose: Pose2) -> int:
+        """Of the keys within reach_m along the way of a place, the one that saw it from nearest to a pose."""
+        rows = self._around(place, key, reach_m, len(self.snapshot.poses))
+        off = self.snapshot.poses[rows] - np.array([pose.x_m, pose.y_m, pose.yaw_rad])
+        return int(rows[np.argmin(np.hypot(off[:, 0], off[:, 1]) + 1.0 - np.cos(off[:, 2]))])
 
     def _around(self, place: int, key: int, reach_m: float, most: int) -> I64:
         """Keys within reach_m along the way of a place, evenly thinned to `most`; the place itself is one."""
@@ -302,15 +314,19 @@ class Work:
         for place in places:
             drift = float(self._drift(way_m[place]))
             turn = min(s.turn_most_rad, s.turn_start_rad + s.turn_rad_per_m * float(way_m[place]))
-            rows = self._around(place, key, max(s.place_m, 0.5 * drift), 16)
+            reach_m = float(self._reach_m(np.array(drift)))
+            rows = self._around(place, key, reach_m, 16)
             raster = raster_of(shot.views, rows, shot.poses[rows], window_m=drift)
-            spot = find_view(view, raster, here, window_m=drift, turn_rad=turn)
+            spot = find_view(view, raster, here, window_m=drift, turn_rad=turn, doubtful_share=s.rival)
             if spot is None or spot.score < s.score:
                 self._events["no_place_fits"] += 1
                 continue
             if spot.rival > s.rival:
                 self._events["ambiguous"] += 1
                 continue
+            if reach_m > s.place_m:
+                place = self._nearest(place, key, reach_m, spot.pose)
+                rows = self._around(place, key, s.place_m, 16)
             match = match_view(view, shot.views, rows, shot.poses[rows], spot.pose, reach=REFINING)
             closure = self._judged(key, place, rows, match, spot.pose, 0.6, searched=True)
             if closure is not None:
