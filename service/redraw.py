@@ -118,10 +118,13 @@ class Redrawn:
 
 @dataclass(frozen=True, slots=True)
 class RedrawState:
-    """What is kept for drawing again, to be stored. drawn: (N, 2, 3) as in Job.  base: tiles under it all."""
+    """What is kept for drawing again, to be stored. drawn: (N, 2, 3) as in Job.  serials: (N,) numbers that rise and
+    are never used again; next_serial comes next.  base: tiles under it all."""
 
     kept: tuple[Kept, ...]
     drawn: F64
+    serials: NDArray[np.int64]
+    next_serial: int
     base: Mapping[Place, bytes]
 
 
@@ -150,6 +153,7 @@ class Redrawer:
         self._submit = submit
         self._kept: list[Kept] = []
         self._serial: list[int] = []  # of what is kept: rises
+        self._next_serial = 0
         self._places = KeptPlaces()
         self._gone: set[int] = set()  # serials that go as soon as no job sees them
         self._key: NDArray[np.int64] = np.zeros(64, dtype=np.int64)
@@ -199,7 +203,7 @@ class Redrawer:
             self._reach = np.concatenate((self._reach, np.zeros_like(self._reach)))
         self._key[n], self._in_key[n], self._drawn[n], self._reach[n] = kept.key, kept.in_key, ends, kept.reach_m
         self._kept.append(kept)
-        serial = self._serial[-1] + 1 if self._serial else 0
+        serial, self._next_serial = self._next_serial, self._next_serial + 1
         self._serial.append(serial)
         self._gone.update(self._places.add(serial, _name(kept), ends[0], self._profile(kept, ends[0])))
         if len(self._gone) >= GIVE_UP_AT_ONCE:
@@ -233,22 +237,27 @@ class Redrawer:
     def start_over(self, base: Iterable[tuple[int, int, bytes]] = ()) -> None:
         """Forget what was kept; base: tiles of the map that is there now."""
         self._kept, self._under_way = [], None
-        self._serial, self._places = [], KeptPlaces()
+        self._serial, self._next_serial, self._places = [], 0, KeptPlaces()
         self._gone.clear()
         self._last.clear()
         self._base = {(row, col): payload for row, col, payload in base}
 
     def state(self) -> RedrawState:
         """As of now."""
-        return RedrawState(tuple(self._kept), self._drawn[: len(self._kept)].copy(), self._base)
+        serials = np.array(self._serial, dtype=np.int64)
+        return RedrawState(
+            tuple(self._kept), self._drawn[: len(self._kept)].copy(), serials, self._next_serial, self._base
+        )
 
     def resume(self, state: RedrawState) -> None:
         """Take up what was kept of the map that is there now."""
         self.start_over()
         self._base = dict(state.base)
-        for kept, ends in zip(state.kept, state.drawn):
+        for kept, ends, serial in zip(state.kept, state.drawn, state.serials.tolist()):
             if isinstance(kept, KeptRound) or kept.sensor in self._mounts:
+                self._next_serial = serial
                 self._keep(kept, ends)
+        self._next_serial = state.next_serial
 
     def forget_recent(self) -> None:
         """The robot was put elsewhere: what is around it begins again, and the next sweep is kept."""

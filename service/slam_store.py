@@ -2,7 +2,7 @@
 
     row 0  key scans, 64 a tile: points in millimetres, normals, how good they are; motion between them
     row 1  the graph as it stands: poses, closures, where every kept sweep is drawn
-    row 2  kept sweeps and sonar rounds, 128 a tile
+    row 2  kept sweeps and sonar rounds, by number, 128 a tile; of what was given up nothing is left but the gap
     row 3  stored tiles that lie under everything that is drawn again
 
 A tile is a numpy archive of plain arrays (nothing in it can execute), compressed; equal contents give equal bytes.
@@ -55,23 +55,21 @@ class Keeper:
 
     def __init__(self) -> None:
         self._keys = 0
-        self._kept = 0
+        self._kept: dict[int, tuple[int, ...]] | None = None  # serials in each tile
         self._graph = b""
         self._base: set[tuple[int, int]] | None = None
 
     def changed_tiles(self, stored: Stored) -> list[Tile]:
         """Tiles that differ from those made last; slow, for the thread that writes."""
-        keys, kept = stored.slam.views.count, len(stored.redraw.kept)
+        keys, kept = stored.slam.views.count, _by_tile(stored.redraw)
         tiles = [
             (_KEYS, number, _key_tile(stored.slam, number))
             for number in range(self._keys // KEYS_A_TILE, -(-keys // KEYS_A_TILE))
         ] if keys != self._keys else []  # fmt: skip
-        if kept != self._kept:
-            first = self._kept // KEPT_A_TILE
-            tiles += [
-                (_KEPT, number, _kept_tile(stored.redraw.kept[number * KEPT_A_TILE : (number + 1) * KEPT_A_TILE]))
-                for number in range(first, -(-kept // KEPT_A_TILE))
-            ]
+        place = {serial: k for k, serial in enumerate(stored.redraw.serials.tolist())}
+        for number, serials in kept.items():
+            if self._kept is None or self._kept.get(number, ()) != serials:
+                tiles.append((_KEPT, number, _kept_tile([stored.redraw.kept[place[serial]] for serial in serials])))
         graph = _graph_tile(stored)
         if graph != self._graph:
             tiles.append((_GRAPH, 0, graph))
@@ -82,6 +80,15 @@ class Keeper:
             ]
         self._keys, self._kept, self._graph, self._base = keys, kept, graph, set(stored.redraw.base)
         return tiles
+
+
+def _by_tile(redraw: RedrawState) -> dict[int, tuple[int, ...]]:
+    """The serials of each tile that there is or ever was."""
+    serials = redraw.serials.tolist()
+    tiles: dict[int, list[int]] = {number: [] for number in range(-(-redraw.next_serial // KEPT_A_TILE))}
+    for serial in serials:
+        tiles[serial // KEPT_A_TILE].append(serial)
+    return {number: tuple(each) for number, each in tiles.items()}
 
 
 def tiles_of(stored: Stored) -> list[Tile]:
@@ -126,11 +133,13 @@ def _stored_of(rows: Mapping[int, Sequence[bytes]]) -> Stored:
         views.arrays(), graph["poses"], graph["travel"], joined["mounts"], joined["stamps"], between["path"],
         between["information"], closures, graph["weight"], int(graph["epoch"]), int(graph["next_number"]),
     )  # fmt: skip
-    kept = [each for payload in rows[_KEPT] for each in _kept_of(_unpack(payload))]
+    kept = [each for payload in rows[_KEPT] if payload for each in _kept_of(_unpack(payload))]
     if len(kept) != m:
         raise ValueError(f"{len(kept)} stored sweeps for {m} poses")
     base = {_PLACE.unpack_from(payload): payload[_PLACE.size :] for payload in rows[_BASE]}
-    return Stored(slam, RedrawState(tuple(kept), graph["drawn"], base))
+    serials = graph["serials"] if "serials" in graph else np.arange(m)  # nothing was given up once
+    next_serial = int(graph["next_serial"]) if "next_serial" in graph else m
+    return Stored(slam, RedrawState(tuple(kept), graph["drawn"], serials, next_serial, base))
 
 
 # --- key scans and graph
@@ -175,6 +184,8 @@ def _graph_tile(stored: Stored) -> bytes:
         epoch=np.array(state.epoch),
         next_number=np.array(state.next_number),
         drawn=stored.redraw.drawn,
+        serials=stored.redraw.serials,
+        next_serial=np.array(stored.redraw.next_serial),
     )
 
 
@@ -182,6 +193,8 @@ def _graph_tile(stored: Stored) -> bytes:
 
 
 def _kept_tile(kept: Sequence[Kept]) -> bytes:
+    if not kept:
+        return b""
     sweeps = [each for each in kept if isinstance(each, KeptSweep)]
     bearings: list[NDArray[np.float32]] = []
     which: list[int] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 
 import numpy as np
@@ -13,10 +14,12 @@ from mapping.frames import Pose2
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.localise.kept_places import BEARINGS, MOST, KeptPlaces, profile_of
 from mapping.localise.kept_sweeps import KeptSweep
+from mapping.localise.slam import Slam
 from mapping.scan import Scan
 from service.background import at_once
 from service.layers import BuildingLayer
-from service.redraw import GIVE_UP_AT_ONCE, Redrawer
+from service.redraw import GIVE_UP_AT_ONCE, Redrawer, RedrawState
+from service.slam_store import Keeper, Stored, stored_of, tiles_of
 
 F64 = NDArray[np.float64]
 
@@ -39,6 +42,14 @@ def seen(pose: Pose2, *, door_is_open: bool) -> F64:
     return np.asarray(np.minimum(to_x, to_y) + np.where(through, BEHIND_M / np.maximum(c, 1e-9), 0.0))
 
 
+def lap_on(redrawer: Redrawer, step: int, *, door_is_open: bool = False) -> None:
+    """The sweep of a step on the way round."""
+    angle = 2.0 * math.pi * step / LAP
+    pose = Pose2(RADIUS_M * math.cos(angle), RADIUS_M * math.sin(angle), angle + 0.5 * math.pi)
+    scan = Scan(step, 0.0, BEARING, seen(pose, door_is_open=door_is_open), 0.05, 10.0)
+    redrawer.keep_sweep("front", scan, 0, Pose2(), np.array([[pose.x_m, pose.y_m, pose.yaw_rad]] * 2))
+
+
 def drive(laps: int, *, open_on: int = -1) -> tuple[Redrawer, BuildingLayer, list[int]]:
     """Round and round; how much is kept after each lap. open_on: the lap on which the door is open."""
     layer = BuildingLayer(OccupancyGrid(), ("front",), publish_period_ns=10**9, update_period_ns=10**8)
@@ -46,10 +57,7 @@ def drive(laps: int, *, open_on: int = -1) -> tuple[Redrawer, BuildingLayer, lis
     kept = []
     for lap in range(laps):
         for step in range(LAP):
-            angle = 2.0 * math.pi * step / LAP
-            pose = Pose2(RADIUS_M * math.cos(angle), RADIUS_M * math.sin(angle), angle + 0.5 * math.pi)
-            scan = Scan(lap * LAP + step, 0.0, BEARING, seen(pose, door_is_open=lap == open_on), 0.05, 10.0)
-            redrawer.keep_sweep("front", scan, 0, Pose2(), np.array([[pose.x_m, pose.y_m, pose.yaw_rad]] * 2))
+            lap_on(redrawer, lap * LAP + step, door_is_open=lap == open_on)
         kept.append(redrawer.kept)
     return redrawer, layer, kept
 
@@ -134,3 +142,59 @@ def test_a_profile_tells_the_farthest_of_each_direction() -> None:
     assert profile[BEARINGS // 4] == 3.0
     assert profile[3 * BEARINGS // 4] > 1e30
     assert np.count_nonzero(profile) == 2
+
+
+def test_what_was_given_up_goes_from_the_store_too() -> None:
+    slam, at_first, later = Slam(), drive(10)[0], drive(10)
+    for step in range(3):
+        pose = Pose2(0.4 * step, 0.0)
+        slam.add_scan(Scan(step, 0.0, BEARING, seen(pose, door_is_open=False), 0.05, 10.0), odom_from_base=pose)
+    keeper, store = Keeper(), dict[tuple[int, int], bytes]()
+
+    def save(redrawer: Redrawer, keeper: Keeper) -> int:
+        tiles = keeper.changed_tiles(Stored(slam.state(), redrawer.state()))
+        store.update({(row, number): payload for row, number, payload in tiles})
+        return sum(row == 2 for row, _, _ in tiles)
+
+    def restored() -> RedrawState:
+        stored = stored_of([(row, number, payload) for (row, number), payload in store.items()])
+        assert stored is not None
+        return stored.redraw
+
+    save(at_first, keeper)
+    assert save(at_first, keeper) == 0
+    for step in range(3 * LAP):  # goes on: the oldest tiles change, and new ones come
+        lap_on(at_first, 10 * LAP + step)
+    assert 0 < save(at_first, keeper) < 12
+    for redrawer, writer in ((at_first, keeper), (later[0], Keeper())):
+        if redrawer is not at_first:
+            store.clear()  # another map
+        save(redrawer, writer)
+        state = restored()
+        np.testing.assert_array_equal(state.serials, redrawer.state().serials)
+        assert [each.in_key.tolist() for each in state.kept] == [each.in_key.tolist() for each in redrawer.state().kept]
+    again = Redrawer([later[1]], later[1], {"front": Pose2()}, submit=at_once)
+    again.resume(state)
+    lap_on(again, 10 * LAP)
+    lap_on(later[0], 10 * LAP)
+    np.testing.assert_array_equal(again.state().serials, later[0].state().serials)
+    save(again, Keeper())
+    assert len(restored().kept) == again.kept
+
+
+def test_maps_that_were_stored_before_anything_was_given_up_are_read() -> None:
+    redrawer, slam = drive(1)[0], Slam()
+    slam.add_scan(Scan(0, 0.0, BEARING, seen(Pose2(), door_is_open=False), 0.05, 10.0))
+    tiles = []
+    for row, number, payload in tiles_of(Stored(slam.state(), redrawer.state())):
+        arrays = dict(np.load(io.BytesIO(payload))) if row == 1 else {}
+        if arrays:
+            del arrays["serials"], arrays["next_serial"]
+            out = io.BytesIO()
+            np.savez(out, **arrays)
+            payload = out.getvalue()
+        tiles.append((row, number, payload))
+    stored = stored_of(tiles)
+    assert stored is not None
+    assert stored.redraw.next_serial == LAP == len(stored.redraw.kept)
+    np.testing.assert_array_equal(stored.redraw.serials, np.arange(LAP))
