@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import serial
 
@@ -30,6 +30,9 @@ from drivers.errors import PortAbsent, PortBusy, PortDenied, PortError
 if TYPE_CHECKING:
     import can
 
+    from drivers.slcan_bus import LawicelBus
+
+T = TypeVar("T")
 Clock = Callable[[], int]
 
 _READ_SIZE = 65536
@@ -314,6 +317,7 @@ class CanPort:
         import can  # here, because robots without a CAN bus need not load it
 
         self._can = can
+        self._slcan: LawicelBus | None = None
         try:
             self._bus = self._open(interface, channel, bitrate_bps)
         except PortError:
@@ -325,6 +329,9 @@ class CanPort:
 
     def read(self, timeout_s: float) -> list[tuple[CanFrame, int]]:
         """All frames that wait, each with its arrival time. Raises PortError when the interface is gone or bus-off."""
+        if self._slcan is not None:  # one wait and one read, where python-can's way takes three of each
+            bus = self._slcan
+            return self._guarded(lambda: bus.frames(timeout_s, _CAN_BATCH))
         frames: list[tuple[CanFrame, int]] = []
         if self._poll is not None:
             # python-can's own waiting goes by the wall clock: set back by an hour, it would wait for an hour.
@@ -391,15 +398,19 @@ class CanPort:
         if interface == "slcan":
             from drivers.slcan_bus import LawicelBus
 
-            return LawicelBus(channel, bitrate_bps=bitrate_bps, clock=self._clock, drops=self.drops)
+            self._slcan = LawicelBus(channel, bitrate_bps=bitrate_bps, clock=self._clock, drops=self.drops)
+            return self._slcan
         # ignore_config: a ~/.canrc of the user must not change which bus this is.
         if interface in ("socketcan", "virtual"):
             return self._can.Bus(interface=interface, channel=channel, ignore_config=True)
         return self._can.Bus(interface=interface, channel=channel, ignore_config=True, bitrate=bitrate_bps)
 
     def _receive(self, timeout_s: float) -> can.Message | None:
+        return self._guarded(lambda: self._bus.recv(timeout_s))
+
+    def _guarded(self, work: Callable[[], T]) -> T:
         try:
-            return self._bus.recv(timeout_s)
+            return work()
         except PortError:
             raise
         except (self._can.CanError, OSError, ValueError) as error:

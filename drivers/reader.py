@@ -37,6 +37,7 @@ _SILENCE_PATIENCE_NS = 400_000_000  # a device that only paused keeps its set-up
 _SHORTEST_BEFORE_RESET_NS = 600_000_000
 _MUCH_LONGER = 1.5  # less is the jitter of its deliveries
 _INTERVALS_KEPT = 9  # the middle one of so many is a source's usual period
+_CHECK_PERIOD_NS = 10_000_000  # silence and words are looked at so often; a change of state at once
 _OWN_PAUSE_NS = 30_000_000  # so much later than it should be, the loop itself was held up
 _SETUP_LIMIT_NS = 20_000_000_000  # spin-up and the search for a line speed included
 _EVENT_PERIOD_NS = 1_000_000_000  # between two events that tell the same state in other words
@@ -326,6 +327,7 @@ class _Source(Generic[WireT]):
         self._seen_state: LinkState | None = None
         self._told: tuple[LinkState, str, Identity | None] | None = None
         self._told_ns = 0
+        self._checked_ns = -_CHECK_PERIOD_NS
         self._since_ns = 0
         self._readings = 0
         self._restarts = 0
@@ -398,6 +400,9 @@ class _Source(Generic[WireT]):
                 self._restart(now_ns)
             return
         try:
+            if self._conversation.state is self._seen_state and now_ns < self._checked_ns + _CHECK_PERIOD_NS:
+                return
+            self._checked_ns = now_ns
             self._supervise(now_ns)
             self._tell(now_ns)
         except Exception as error:

@@ -79,7 +79,7 @@ class LawicelBus(can.BusABC):
         speed = int(baud) if baud.isdigit() else 115200
         self._line: Line = SerialPort(path, baud=speed, clock=clock) if line is None else line
         self._buffer = bytearray()
-        self._frames: deque[can.Message] = deque()
+        self._frames: deque[tuple[CanFrame, int]] = deque()
         self._refusals = 0
         self._answered = False  # before the first frame came or was taken, a refusal is to closing what was not open
         self._line.discard_input()
@@ -111,10 +111,15 @@ class LawicelBus(can.BusABC):
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame; None after timeout, or sooner if what arrived was no frame. Waits by no clock."""
+        frames = self.frames(1.0 if timeout is None else max(timeout, 0.0), 1)
+        return _message_of(*frames[0]) if frames else None
+
+    def frames(self, timeout_s: float, most: int) -> list[tuple[CanFrame, int]]:
+        """Up to `most` frames with their arrival times, as our drivers take them; reads the line once at most."""
         if not self._frames:
-            for chunk, stamp_ns in self._line.read(1.0 if timeout is None else max(timeout, 0.0)):
+            for chunk, stamp_ns in self._line.read(timeout_s):
                 self._take(chunk, stamp_ns)
-        return self._frames.popleft() if self._frames else None
+        return [self._frames.popleft() for _ in range(min(most, len(self._frames)))]
 
     def _take(self, chunk: bytes, stamp_ns: int) -> None:
         self._buffer += chunk
@@ -144,16 +149,7 @@ class LawicelBus(can.BusABC):
         if len(self._frames) >= _MOST_QUEUED:
             self._count("slcan_overrun")
             self._frames.popleft()
-        self._frames.append(
-            can.Message(
-                timestamp=stamp_ns / 1e9,
-                arbitration_id=frame.can_id,
-                is_extended_id=frame.extended,
-                is_remote_frame=frame.remote,
-                dlc=frame.dlc if frame.dlc is not None else len(frame.data),
-                data=None if frame.remote else frame.data,
-            )
-        )
+        self._frames.append((frame, stamp_ns))
 
     def _note_refusal(self) -> None:
         if self._answered:
@@ -168,6 +164,17 @@ class LawicelBus(can.BusABC):
 
     def _count(self, reason: str) -> None:
         self.drops[reason] = self.drops.get(reason, 0) + 1
+
+
+def _message_of(frame: CanFrame, stamp_ns: int) -> can.Message:
+    return can.Message(
+        timestamp=stamp_ns / 1e9,
+        arbitration_id=frame.can_id,
+        is_extended_id=frame.extended,
+        is_remote_frame=frame.remote,
+        dlc=frame.dlc if frame.dlc is not None else len(frame.data),
+        data=None if frame.remote else frame.data,
+    )
 
 
 def encode_line(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> bytes:

@@ -41,7 +41,7 @@ from service.live_map import SLAM, LiveMap, restore
 from service.locks import Claims
 from service.maker_calls import maker_calls
 from service.map_makers import MapMakers, SweepTap
-from service.outputs import HealthOut, Output
+from service.outputs import HealthOut, Output, PolarOut, RectOut
 from service.payloads import RobotInfo, SensorPlace
 from service.publisher import Publisher
 from service.recording import RecordedFusion, Recorder
@@ -183,6 +183,7 @@ class Daemon:
             now_ns=self._clock.now_ns,
             beat=self._notifier.beat,
             health=self._health,
+            offered=self._publisher.wake,
         )
         self._live_map = None
         if maps.building is not None:
@@ -329,7 +330,10 @@ class Daemon:
     def _offer(self, output: Output) -> None:
         if self._ground is not None:
             output = self._ground.with_ground(output)
-        self._publisher.offer(output)
+        if isinstance(output, PolarOut | RectOut):
+            self._publisher.send(output)
+        else:
+            self._publisher.offer(output, wake=False)
         self._makers.take_output(output)
         if self._mavlink is not None:
             self._mavlink.offer(output)

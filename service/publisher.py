@@ -1,8 +1,11 @@
 """Sends outputs over Zenoh: newest wins, nothing blocks, every loss is counted; answers plain get() and calls.
 
-fusion --offer--> outbox --> stream thread --> publishers            (scans, sectors, poses, health)
+fusion --send---------------------------------> publishers            (sector maps: nothing may delay them)
+       --offer--> outbox --> stream thread --> publishers            (scans, poses, ranges, health)
               \\-> outbox --> map thread   --> publishers            (grids: slow, so they delay nothing else)
                              last values --> answer thread --> get()
+
+Waking a thread costs more than most messages: who offers much at once says `wake=False`, and `wake()` once at the end.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import threading
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from service import export, topics, zenoh_session
@@ -55,12 +59,17 @@ class Outbox:
         self._slots: OrderedDict[str, deque[Parcel]] = OrderedDict()
         self._changed = threading.Condition()
         self._closed = False
+        self._asleep = False  # whoever takes waits, and nobody has woken it
         self.dropped: Counter[str] = Counter()
 
-    def put(self, slot: str, parcel: Parcel, *, depth: int = 1, supersedes: str | None = None) -> None:
-        """Add a parcel; beyond depth the slot's oldest is lost. supersedes: a slot that this parcel empties."""
+    def put(
+        self, slot: str, parcel: Parcel, *, depth: int = 1, supersedes: str | None = None, wake: bool = True
+    ) -> None:
+        """Add a parcel; beyond depth the slot's oldest is lost. supersedes: a slot that this parcel empties.
+
+        wake: False if wake() follows soon.
+        """
         with self._changed:
-            was_empty = not self._slots
             if supersedes is not None and (old := self._slots.pop(supersedes, None)):
                 self.dropped[supersedes] += len(old)
             waiting = self._slots.setdefault(slot, deque())
@@ -68,8 +77,19 @@ class Outbox:
             if len(waiting) > depth:
                 waiting.popleft()
                 self.dropped[slot] += 1
-            if was_empty:  # else the one that takes is awake; waking costs more than all else here
-                self._changed.notify()
+            if wake:
+                self._wake()
+
+    def wake(self) -> None:
+        """Whoever takes is to look what waits."""
+        with self._changed:
+            if self._slots:
+                self._wake()
+
+    def _wake(self) -> None:
+        if self._asleep:
+            self._asleep = False
+            self._changed.notify()
 
     def take(self) -> Parcel | None:
         """The parcel that waited longest, waiting for one; None when closed and empty."""
@@ -77,7 +97,9 @@ class Outbox:
             while not self._slots:
                 if self._closed:
                     return None
+                self._asleep = True
                 self._changed.wait()
+            self._asleep = False
             slot, waiting = next(iter(self._slots.items()))
             parcel = waiting.popleft()
             if not waiting:
@@ -161,8 +183,20 @@ class Publisher:
         self._threads.append(thread)
         thread.start()
 
-    def offer(self, output: Output) -> None:
-        """Send this soon, or something newer of its kind. Never waits; any thread.
+    def send(self, output: PolarOut | RectOut) -> None:
+        """Send a sector map at once, from the thread that has it; each map from one thread.
+
+        A congested link may hold this up as long as Zenoh waits before it drops, a millisecond by default.
+        """
+        self._send_all(partial(self._encode, output))
+
+    def wake(self) -> None:
+        """After outputs were offered with wake=False."""
+        for outbox in self._outboxes.values():
+            outbox.wake()
+
+    def offer(self, output: Output, *, wake: bool = True) -> None:
+        """Send this soon, or something newer of its kind. Never waits; any thread. wake: False if wake() follows.
 
         Full grids are to be offered at most once a second, each before the updates of its epoch.
         """
@@ -173,17 +207,17 @@ class Publisher:
 
         match output:
             case GridOut(name="grid"):
-                self._outboxes[Lane.MAP].put(slot, parcel, supersedes=topics.MAP_GRID_UPDATE.pattern)
+                self._outboxes[Lane.MAP].put(slot, parcel, supersedes=topics.MAP_GRID_UPDATE.pattern, wake=wake)
             case GridOut() | CloudOut():
-                self._outboxes[Lane.MAP].put(slot, parcel)
+                self._outboxes[Lane.MAP].put(slot, parcel, wake=wake)
             case DocumentOut():
-                self._outboxes[topics.topic_of(output.key).lane].put(slot, parcel)
+                self._outboxes[topics.topic_of(output.key).lane].put(slot, parcel, wake=wake)
             case LookOut():
                 pass  # for the makers of maps only
             case GridUpdateOut():
-                self._outboxes[Lane.MAP].put(slot, parcel, depth=_UPDATES_WAITING_MAX)
+                self._outboxes[Lane.MAP].put(slot, parcel, depth=_UPDATES_WAITING_MAX, wake=wake)
             case _:
-                self._outboxes[Lane.STREAM].put(slot, parcel)
+                self._outboxes[Lane.STREAM].put(slot, parcel, wake=wake)
 
     def publish_info(self, info: RobotInfo) -> None:
         """Send `info` and the fixed transforms; again whenever they change."""
@@ -225,12 +259,15 @@ class Publisher:
 
     def _send_loop(self, outbox: Outbox) -> None:
         while (parcel := outbox.take()) is not None:
-            try:
-                for message in parcel():
-                    self._send(message)
-            except Exception as error:  # one bad value must not silence the robot; it is counted and told once
-                self._counts["not_sent_errors"] += 1
-                self._complain(error)
+            self._send_all(parcel)
+
+    def _send_all(self, parcel: Parcel) -> None:
+        try:
+            for message in parcel():
+                self._send(message)
+        except Exception as error:  # one bad value must not silence the robot; it is counted and told once
+            self._counts["not_sent_errors"] += 1
+            self._complain(error)
 
     def _complain(self, error: Exception) -> None:
         kind = f"{type(error).__name__}: {error}"[:200]

@@ -60,9 +60,12 @@ class Worker:
         now_ns: Callable[[], int],
         beat: Callable[[int], None],
         health: Callable[[int], HealthOut],
+        offered: Callable[[], None] = lambda: None,
     ) -> None:
+        """offered: called when nothing more is offered for a while."""
         self._fusion = fusion
         self._offer = offer
+        self._offered = offered
         self._now_ns = now_ns
         self._beat = beat
         self._health = health
@@ -125,12 +128,14 @@ class Worker:
                 self._next_health_ns = min(self._next_health_ns, self._health_told_ns + _HEALTH_GAP_NS)
         now_ns = self._now_ns()
         if items:
+            self._offered()  # before the slow part
             self._guard("settle", partial(self._settle, now_ns))
         if now_ns >= self._next_tick_ns:
             self._next_tick_ns = now_ns + TICK_PERIOD_NS
             self._guard("tick", partial(self._fusion.tick, now_ns))
         if now_ns >= self._next_health_ns:
             self._tell_health(now_ns)
+        self._offered()
         self._beat(now_ns)
         self.longest_turn_ns = max(self.longest_turn_ns, self._now_ns() - began_ns)
 

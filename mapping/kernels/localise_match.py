@@ -24,6 +24,8 @@ FIRST, WIDTH, BINS, CLOSED = 0, 1, 2, 3
 
 NEIGHBOURS = 8  # points on either side that may define a normal
 WIDEST_BINS = 24.0  # half of the widest window of bearings that is searched
+ASIDE_SLACK_RAD = 1e-4  # more than bearing_of and the rounding of points are off
+FARTHEST_ASIDE_RAD = 1.4  # up to where a - a^3 / 6 grows
 FACING = 0.6  # cosine: surfaces that meet under a larger angle are not the same one
 
 LEVELS = 4
@@ -165,6 +167,8 @@ def nearest_bin(px: float, py: float, reach_m: float, coarse: bool, x: Any, y: A
     """The bin of a view whose point with a normal lies nearest to (px, py), within reach_m; -1 if none does.
 
     Points within reach lie within asin(reach / range) of its bearing. coarse: every other bin of wide windows only.
+    Bins are looked at from the point's own bearing outwards: what lies `a` radians aside is at least r sin(a) away, and
+    a - a^3 / 6 is less than sin(a). Of points that are equally near, that of the lowest bin counts.
     """
     bins = int(frame[BINS])
     r = math.sqrt(px * px + py * py)
@@ -173,22 +177,32 @@ def nearest_bin(px: float, py: float, reach_m: float, coarse: bool, x: Any, y: A
         half = min(half, 1.05 * reach_m / (r * frame[WIDTH]) + 0.5)
     middle = bin_of(bearing_of(px, py), frame)
     low, high = middle - int(half), middle + int(half)
+    first = low
     if frame[CLOSED] == 0.0:
         low, high = max(low, 0), min(high, bins - 1)
+        first = low
     step = 2 if coarse and half > 5.0 else 1
-    best, at = reach_m * reach_m, -1
-    for k in range(low, high + 1, step):
-        b = k
-        if b < 0:
-            b += bins
-        elif b >= bins:
-            b -= bins
-        if quality[b] <= 0.0:
-            continue
-        dx, dy = x[b] - px, y[b] - py
-        square = dx * dx + dy * dy
-        if square < best:
-            best, at = square, b
+    begin = first + (min(max(middle, first), high) - first) // step * step  # down from here, up from the next
+    best, at, at_k = reach_m * reach_m, -1, 0
+    for side in (-1, 1):
+        k = begin if side < 0 else begin + step
+        while low <= k <= high:
+            aside = min((abs(k - middle) - 1) * frame[WIDTH] - ASIDE_SLACK_RAD, FARTHEST_ASIDE_RAD)
+            if aside > 0.0:
+                apart = r * aside * (1.0 - aside * aside / 6.0)
+                if apart * apart > best:
+                    break
+            b = k
+            if b < 0:
+                b += bins
+            elif b >= bins:
+                b -= bins
+            if quality[b] > 0.0:
+                dx, dy = x[b] - px, y[b] - py
+                square = dx * dx + dy * dy
+                if square < best or (square == best and at >= 0 and k < at_k):
+                    best, at, at_k = square, b, k
+            k += side * step
     return at
 
 

@@ -341,6 +341,29 @@ def test_slcan_burst_keeps_all_and_their_order(pty: Pty) -> None:
     port.close()
 
 
+def test_slcan_frames_carry_the_time_at_which_their_bytes_came(pty: Pty) -> None:
+    port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
+    before_ns = CLOCK()
+    pty.send(b"t1230\r" * 300)
+    read = port.read(1.0)
+    later = port.read(0.0)  # what one read may not hand out at once is there without another byte
+    while len(read) + len(later) < 300:
+        later += port.read(1.0)
+    stamps = [stamp_ns for _, stamp_ns in read + later]
+    assert len(read) == 256 and stamps == sorted(stamps) and before_ns <= stamps[0] <= stamps[-1] <= CLOCK()
+    port.close()
+
+
+def test_slcan_serves_other_users_of_the_bus(pty: Pty) -> None:
+    bus = LawicelBus(pty.path, bitrate_bps=1_000_000, clock=CLOCK)
+    pty.send(b"t1232AABB\r")
+    message = bus.recv(1.0)
+    assert message is not None and (message.arbitration_id, bytes(message.data)) == (0x123, b"\xaa\xbb")
+    assert 0.0 < message.timestamp <= CLOCK() / 1e9
+    assert bus.recv(0.0) is None
+    bus.shutdown()
+
+
 def test_slcan_endless_line_needs_no_memory(pty: Pty) -> None:
     port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
     for _ in range(10):

@@ -68,6 +68,31 @@ def test_what_is_put_is_taken_or_counted(puts: list[tuple[str, int]]) -> None:
         assert last is None or last in mine
 
 
+def test_who_takes_sleeps_until_it_is_woken() -> None:
+    """Waking is dear: what is put quietly waits for wake(), and that finds it even if more was put since."""
+    outbox, came = Outbox(), threading.Semaphore(0)
+    numbers: list[Any] = []
+
+    def take() -> None:
+        while (item := outbox.take()) is not None:
+            numbers.extend(item())
+            came.release()
+
+    outbox.wake()  # nothing waits, nobody sleeps
+    thread = threading.Thread(target=take)
+    thread.start()
+    for round_ in range(50):
+        outbox.put("a", parcel(2 * round_), wake=False)
+        outbox.put("b", parcel(2 * round_ + 1), wake=round_ % 2 == 0)
+        if round_ % 2:
+            outbox.wake()
+        assert came.acquire(timeout=5.0) and came.acquire(timeout=5.0)
+    outbox.put("a", parcel(100), wake=False)
+    outbox.close()
+    thread.join(5.0)
+    assert numbers == list(range(101))
+
+
 def test_a_full_grid_supersedes_the_updates_before_it() -> None:
     outbox = Outbox()
     outbox.put("grid", parcel(1), supersedes="update")
