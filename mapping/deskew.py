@@ -7,6 +7,7 @@ Every beam has its time, so every beam has its own sensor pose; all are expresse
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,15 @@ class Deskewed:
 
 def beam_stamps(scan: Scan) -> NDArray[np.int64]:
     """(N,) when each beam was measured."""
-    late = np.rint(np.arange(len(scan.bearing_rad)) * scan.beam_period_ns).astype(np.int64)
-    return np.asarray(scan.stamp_ns + late)
+    return np.asarray(scan.stamp_ns + _late_ns(len(scan.bearing_rad), scan.beam_period_ns))
+
+
+@lru_cache(32)
+def _late_ns(beams: int, beam_period_ns: float) -> NDArray[np.int64]:
+    """(N,) after the first beam: the same for every sweep of a sensor that keeps its speed."""
+    late: NDArray[np.int64] = np.rint(np.arange(beams) * beam_period_ns).astype(np.int64)
+    late.setflags(write=False)
+    return late
 
 
 def deskew(scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> Deskewed:

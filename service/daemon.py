@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import gc
 import hashlib
 import logging
 import math
@@ -96,6 +97,8 @@ class Daemon:
             except StoppedWhileCompiling:
                 log.info("stopped before the kernels were ready")
                 return 0
+            gc.collect()
+            gc.freeze()  # modules and kernels stay: looking through them again would hold every thread for 50 ms
             try:
                 self._notifier.ready(self._summary())
                 log.info("%s", self._summary())

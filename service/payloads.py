@@ -117,6 +117,7 @@ class Encoder:
         self._frames = frames or Frames()
         self._range_messages = range_messages
         self._scan_stamps: dict[str, int] = {}
+        self._beams: dict[str, Beams] = {}
         self._polar_heads: dict[str, tuple[bytes, list[str]]] = {}
         self._rect_heads: dict[str, tuple[bytes, list[str]]] = {}
         self._grid: _GridPlace | None = None
@@ -172,7 +173,10 @@ class Encoder:
         period_ns = out.scan.stamp_ns - self._scan_stamps.get(out.sensor, out.scan.stamp_ns)
         self._scan_stamps[out.sensor] = out.scan.stamp_ns
         scan_time_s = period_ns / _NANOS if 0 < period_ns < _LONGEST_SCAN_PERIOD_NS else 0.0
-        payload = cdr.encode_laser(laser_message(out.scan, out.sensor, stamp_ns, scan_time_s))
+        beams = self._beams.get(out.sensor)
+        if beams is None or beams.bearing_rad is not out.scan.bearing_rad:
+            beams = self._beams[out.sensor] = Beams.of(out.scan.bearing_rad)
+        payload = cdr.encode_laser(laser_message(out.scan, out.sensor, stamp_ns, scan_time_s, beams=beams))
         return Message(topics.SCAN, f"scan/{out.sensor}", payload, stamp_ns)
 
     def _cloud(self, out: CloudOut, offset_ns: int) -> Message:
@@ -340,7 +344,37 @@ def document_message(out: DocumentOut, wall_offset_ns: int) -> Message:
     return Message(topic, out.key, _json(document), stamp_ns)
 
 
-def laser_message(scan: Scan, frame: str, stamp_ns: int, scan_time_s: float) -> cdr.Laser:
+@dataclass(frozen=True, slots=True)
+class Beams:
+    """How a sensor's beams lie, worked out once for all sweeps with these very bearings.
+
+    first_rad, increment_rad: of even beams; is_even: whether they are so.  unwrapped_rad: (N,) without jumps.
+    """
+
+    bearing_rad: F64
+    unwrapped_rad: F64
+    first_rad: float
+    increment_rad: float
+    is_even: bool
+
+    @classmethod
+    def of(cls, bearing_rad: F64) -> Beams:
+        """bearing_rad: (N,); what is still writeable is copied, so that it is never taken for itself."""
+        count = bearing_rad.size
+        if count == 0:
+            return cls(bearing_rad, bearing_rad, 0.0, 0.0, True)
+        unwrapped: F64 = np.unwrap(bearing_rad)
+        first = float(unwrapped[0])
+        increment = float(unwrapped[-1] - unwrapped[0]) / (count - 1) if count > 1 else 0.0
+        ideal = unwrapped[0] + increment * np.arange(count)
+        even = not np.abs(unwrapped - ideal).max() > _UNEVEN * abs(increment)
+        known = bearing_rad.copy() if bearing_rad.flags.writeable else bearing_rad
+        return cls(known, unwrapped, first, increment, even)
+
+
+def laser_message(
+    scan: Scan, frame: str, stamp_ns: int, scan_time_s: float, *, beams: Beams | None = None
+) -> cdr.Laser:
     """A scan as LaserScan (REP-117: +inf nothing, -inf too close, NaN invalid).
 
     The message knows only evenly spaced beams, in the order measured (a scanner that turns clockwise has a negative
@@ -351,20 +385,20 @@ def laser_message(scan: Scan, frame: str, stamp_ns: int, scan_time_s: float) -> 
     if count == 0:
         nothing = np.zeros(0, dtype=np.float32)
         return cdr.Laser(stamp_ns, frame, 0.0, 0.0, 0.0, 0.0, scan_time_s, scan.range_min_m, scan.range_max_m, nothing)
-    bearing: F64 = np.unwrap(scan.bearing_rad)
-    span = float(bearing[-1] - bearing[0])
-    increment = span / (count - 1) if count > 1 else 0.0
+    beams = Beams.of(scan.bearing_rad) if beams is None else beams
+    first, increment = beams.first_rad, beams.increment_rad
+    last = float(beams.unwrapped_rad[-1])
     ranges = scan.range_m.astype(np.float32)
-    ideal = bearing[0] + increment * np.arange(count)
-    if np.abs(bearing - ideal).max() > _UNEVEN * abs(increment):
-        ranges, low, span = _even_bins(bearing, ranges)
+    if not beams.is_even:
+        ranges, low, span = _even_bins(beams.unwrapped_rad, ranges)
         increment = span / (count - 1)
         bearing = np.asarray(low + increment * np.arange(count))
+        first, last = float(bearing[0]), float(bearing[-1])
     return cdr.Laser(
         stamp_ns,
         frame,
-        float(bearing[0]),
-        float(bearing[-1]),
+        first,
+        last,
         increment,
         scan.beam_period_ns / _NANOS,
         scan_time_s,
@@ -626,4 +660,6 @@ def _texts(values: F64, layout: str) -> list[str]:
 
 
 def _ages(age_ns: I64) -> list[str]:
-    return ["%.3f" % (age / _NANOS) if age >= 0 else "null" for age in age_ns.tolist()]
+    ages = age_ns.tolist()  # one stamp stands for many sectors
+    texts = {age: "%.3f" % (age / _NANOS) if age >= 0 else "null" for age in set(ages)}
+    return [texts[age] for age in ages]

@@ -194,7 +194,7 @@ def _as_seen_from(middle: Pose2, scan: Scan, poses: F64) -> Scan | None:
     """
     if len(poses) != len(scan.bearing_rad):
         return None
-    if np.ptp(poses, axis=0).max() < 1e-6:
+    if np.abs(poses[-1] - poses[0]).max(initial=0.0) < 1e-6 and np.ptp(poses, axis=0).max() < 1e-6:
         return scan
     hit = np.isfinite(scan.range_m)
     bearing = scan.bearing_rad + (poses[:, 2] - middle.yaw_rad)
@@ -207,10 +207,13 @@ def _as_seen_from(middle: Pose2, scan: Scan, poses: F64) -> Scan | None:
     distance[hit] = np.hypot(points[:, 0], points[:, 1])
     # A beam without a range may end up beside its neighbours' order; where it does, it tells nothing.
     order = np.sign(scan.bearing_rad[-1] - scan.bearing_rad[0])
-    kept = np.ones(len(bearing), dtype=bool)
-    for k in np.flatnonzero(~hit):
-        beside = bearing[max(0, k - 1) : k + 2] * order
-        kept[k] = bool(np.all(np.diff(beside) > 0.0))
+    if len(bearing) < 3:
+        return None
+    onward = np.diff(bearing) * order > 0.0
+    kept = hit.copy()
+    kept[1:-1] |= onward[:-1] & onward[1:]
+    kept[0] |= onward[0]
+    kept[-1] |= onward[-1]
     bearing, distance = bearing[kept], distance[kept]
     if len(bearing) < 3 or not np.all(np.diff(bearing) * order > 0.0):
         return None

@@ -350,7 +350,9 @@ def test_slcan_frames_carry_the_time_at_which_their_bytes_came(pty: Pty) -> None
     while len(read) + len(later) < 300:
         later += port.read(1.0)
     stamps = [stamp_ns for _, stamp_ns in read + later]
-    assert len(read) == 256 and stamps == sorted(stamps) and before_ns <= stamps[0] <= stamps[-1] <= CLOCK()
+    assert len(read) == 256
+    assert stamps == sorted(stamps)
+    assert before_ns <= stamps[0] <= stamps[-1] <= CLOCK()
     port.close()
 
 
@@ -358,7 +360,8 @@ def test_slcan_serves_other_users_of_the_bus(pty: Pty) -> None:
     bus = LawicelBus(pty.path, bitrate_bps=1_000_000, clock=CLOCK)
     pty.send(b"t1232AABB\r")
     message = bus.recv(1.0)
-    assert message is not None and (message.arbitration_id, bytes(message.data)) == (0x123, b"\xaa\xbb")
+    assert message is not None
+    assert (message.arbitration_id, bytes(message.data)) == (0x123, b"\xaa\xbb")
     assert 0.0 < message.timestamp <= CLOCK() / 1e9
     assert bus.recv(0.0) is None
     bus.shutdown()

@@ -86,7 +86,8 @@ def test_who_takes_sleeps_until_it_is_woken() -> None:
         outbox.put("b", parcel(2 * round_ + 1), wake=round_ % 2 == 0)
         if round_ % 2:
             outbox.wake()
-        assert came.acquire(timeout=5.0) and came.acquire(timeout=5.0)
+        assert came.acquire(timeout=5.0)
+        assert came.acquire(timeout=5.0)
     outbox.put("a", parcel(100), wake=False)
     outbox.close()
     thread.join(5.0)
