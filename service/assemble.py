@@ -623,7 +623,29 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
                 period_ns=round(wanted.period_s * 1e9),
             )
         )
+    if config.agreement.enabled and config.grid.enabled:
+        makers.extend(_agreement_maker(config, makers, lasers))
     return makers
+
+
+def _agreement_maker(config: Config, makers: Sequence[MapMaker], lasers: frozenset[str]) -> Iterator[MapMaker]:
+    """After the makers whose maps it compares; none if there is nothing to compare."""
+    known = {maker.name: maker for maker in makers}
+    if not known.keys() & {"lines", "rooms", "topo"}:
+        return
+    from service.agreement_maker import AgreementMaker
+    from service.line_maker import LineMaker
+    from service.room_maker import RoomMaker
+    from service.topo_maker import TopoMaker
+
+    lines, rooms, topo = (known.get(name) for name in ("lines", "rooms", "topo"))
+    yield AgreementMaker(
+        lines=lines if isinstance(lines, LineMaker) else None,
+        rooms=rooms if isinstance(rooms, RoomMaker) else None,
+        topo=topo if isinstance(topo, TopoMaker) else None,
+        sources=lasers,
+        period_ns=round(config.agreement.period_s * 1e9),
+    )
 
 
 def _has_rooms(config: Config, found: Mapping[str, Sensor]) -> bool:

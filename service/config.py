@@ -34,6 +34,7 @@ from service.config_devices import (
 from service.config_faults import Fault, faults_of, without_faults
 from service.config_files import KeyPath, Layers, find_config, origin_of, read_layers
 from service.config_maps import (
+    AgreementSettings,
     Alignment,
     Artos,
     ClearanceSettings,
@@ -79,6 +80,7 @@ class Config(Section):
     topo: TopoMapSettings = Field(default=TopoMapSettings(), description="Regions of free space and ways between them.")
     scenes: SceneMapSettings = Field(default=SceneMapSettings(), description="Scenes to be recognised again.")
     rooms: RoomMapSettings = Field(default=RoomMapSettings(), description="Rooms, doors, plans.")
+    agreement: AgreementSettings = Field(default=AgreementSettings(), description="Maps held against each other.")
     slam: SlamLive = Field(default=SlamLive(), description="Where the robot is, by laser scans.")
     localise: LocaliseIn = Field(default=LocaliseIn(), description="Finding the robot in a given map.")
     alignment: Alignment = Field(default=Alignment(), description="How long readings wait for each other.")

@@ -192,6 +192,15 @@ class RoomMapSettings(Section):
     clearance_m: float = Field(default=0.3, ge=0.0, le=10.0, description="What plans keep off, if they are not told.")
 
 
+class AgreementSettings(Section):
+    """Grid, lines, rooms and regions held against each other: key map/agreement. Needs [grid]."""
+
+    enabled: bool = Field(default=True, description="Do it.")
+    period_s: float = Field(
+        default=2.0, ge=1.0, le=3600, description="Shortest time between two comparisons; longer for a large map."
+    )
+
+
 class SlamLive(Section):
     """Where the robot is: found by laying laser scans on each other, not by the wheels alone."""
 

@@ -93,8 +93,17 @@ class LineMaker:
         if self.line_map.version == self._told_version:
             return []
         self._told_version = self.line_map.version
-        fields = lines_fields(self.line_map.lines(min_seen=self._min_seen), version=self.line_map.version)
+        fields = lines_fields(self.told_lines(), version=self.line_map.version)
         return [DocumentOut(KEY, view.stamp_ns, fields)]
+
+    @property
+    def map_version(self) -> int:
+        """Rises when the map changes."""
+        return self.line_map.version
+
+    def told_lines(self) -> Lines:
+        """Those that are published."""
+        return self.line_map.lines(min_seen=self._min_seen)
 
     def changed_tiles(self) -> list[Tile]:
         """The lines that are told, in 20 bytes each."""

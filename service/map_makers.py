@@ -119,6 +119,15 @@ class MadeOfLooks(Protocol):
         """One look."""
 
 
+@runtime_checkable
+class Counting(Protocol):
+    """A maker whose counters belong into the health of the daemon."""
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """By name; the names are always the same."""
+
+
 @dataclass(slots=True)
 class _Desk:
     """What the thread remembers of one maker."""
@@ -258,7 +267,12 @@ class MapMakers:
         self.ask(take)
 
     def counters(self) -> Mapping[str, int]:
-        return dict(self.counts)
+        """Our own, and those of makers that count."""
+        counts = dict(self.counts)
+        for desk in self._desks:
+            if isinstance(desk.maker, Counting):
+                counts |= desk.maker.counts
+        return counts
 
     # --- the thread
 

@@ -56,6 +56,23 @@ class _End:
     cells: Bools | None
 
 
+@dataclass(frozen=True, slots=True)
+class FoundRooms:
+    """What was found last. patch: the part of the grid it was found in.  labels: (R, C) numbers there, 0 for none.
+
+    numbers, rooms: (N,) numbers and ids of the rooms.  middles_m: (N, 2).  doors: ids of the two rooms of each.
+    door_ends_m: (M, 2, 2).
+    """
+
+    patch: GridPatch
+    labels: NDArray[np.int32]
+    numbers: NDArray[np.int64]
+    rooms: list[int]
+    middles_m: F64
+    doors: list[tuple[int, int]]
+    door_ends_m: F64
+
+
 class RoomMaker:
     """A map maker: rooms and doors of the newest grid, with ids and names that stay."""
 
@@ -88,6 +105,7 @@ class RoomMaker:
         self._told = b""
         self._planned: dict[str, Any] | None = None
         self._version = 0
+        self._turns = 0
         self._stamp_ns = 0
 
     @property
@@ -117,6 +135,7 @@ class RoomMaker:
         self._ids = self._book.update(self._found, row0=patch.row0, col0=patch.col0, entered=entered)
         self._draw_diagram(free)
         self._find_middles()
+        self._turns += 1
         return self.news()
 
     def _draw_diagram(self, free: Bools) -> None:
@@ -202,6 +221,30 @@ class RoomMaker:
             if door.a in ids and door.b in ids
         ]
         return {"rooms": rooms, "doors": doors}
+
+    @property
+    def map_version(self) -> int:
+        """Rises with every turn."""
+        return self._turns
+
+    def found_rooms(self) -> FoundRooms | None:
+        """Rooms and doors as they were found last, only those that have an id; None before that."""
+        if self._found is None or self._grid is None:
+            return None
+        found, grid, ids = self._found, self._grid, self._ids
+        doors = [door for door in found.doors if door.a in ids and door.b in ids]
+        ends = [[_middle(end, grid) for end in door.ends] for door in doors]
+        numbers = sorted(ids)
+        middles = [self._middles[ids[number]] for number in numbers]
+        return FoundRooms(
+            grid,
+            found.labels,
+            np.array(numbers, dtype=np.int64),
+            [ids[number] for number in numbers],
+            (np.array(middles, dtype=np.float64).reshape(-1, 2)[:, ::-1] + 0.5) * grid.resolution_m,
+            [(min(ids[door.a], ids[door.b]), max(ids[door.a], ids[door.b])) for door in doors],
+            np.array(ends, dtype=np.float64).reshape(-1, 2, 2),
+        )
 
     def changed_tiles(self) -> list[Tile]:
         """Territories of rooms, by id, and the names."""

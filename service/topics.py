@@ -24,6 +24,7 @@ JSON_LOCALISATION = "application/json;umfeld.localisation.v1"
 JSON_ELEVATION = "application/json;umfeld.elevation.v1"
 JSON_ROOMS = "application/json;umfeld.rooms.v1"
 JSON_PLAN = "application/json;umfeld.plan.v1"
+JSON_AGREEMENT = "application/json;umfeld.agreement.v1"
 JSON_REPLY = "application/json;umfeld.reply.v1"
 
 _CHUNK = re.compile(r"[a-z0-9_-]+\Z")
@@ -324,6 +325,16 @@ MAP_PLAN = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+MAP_AGREEMENT = Topic(
+    "map/agreement",
+    "umfeld.agreement.v1",
+    JSON_AGREEMENT,
+    "at most every 2 s, on change",
+    "Where the grid, the lines, the rooms and the regions contradict each other, counted by kind.",
+    Priority.DATA_LOW,
+    cached=True,
+    lane=Lane.MAP,
+)
 HEALTH = Topic(
     "health",
     DIAGNOSTICS,
@@ -388,6 +399,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_TOPO,
     MAP_ROOMS,
     MAP_PLAN,
+    MAP_AGREEMENT,
     HEALTH,
     HEALTH_JSON,  # before health/<sensor>: the exact key wins
     HEALTH_ONE,

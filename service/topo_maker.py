@@ -64,6 +64,16 @@ class TopoMaker:
         self._version += 1
         return [DocumentOut(KEY, view.stamp_ns, {"frame": "map", "version": self._version, **fields})]
 
+    @property
+    def map_version(self) -> int:
+        """Rises when the map changes."""
+        return self._version
+
+    @property
+    def regions(self) -> RegionMap | None:
+        """As they were found last."""
+        return self._regions
+
     def changed_tiles(self) -> list[Tile]:
         return []
 

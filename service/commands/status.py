@@ -39,12 +39,14 @@ def status(
     with Client(connect or daemon_endpoint(find_config(config))) as client:
         base = client.only_base(None if robot is None else f"robots/{robot}")
         values = {each.key.removeprefix(f"{base}/"): each.payload for each in client.get(f"{base}/health/json")}
-        values |= {each.key.removeprefix(f"{base}/"): each.payload for each in client.get(f"{base}/pose")}
+        for key in ("pose", "map/agreement"):
+            values |= {each.key.removeprefix(f"{base}/"): each.payload for each in client.get(f"{base}/{key}")}
     if "health/json" not in values:
         raise Trouble(f"{base} has said nothing about its health yet; try again in a second")
     document = json.loads(values["health/json"])
     document["base"] = base
     document["pose"] = pose_in(values["pose"]) if "pose" in values else None
+    document["agreement"] = json.loads(values["map/agreement"]) if "map/agreement" in values else None
     if as_json:
         typer.echo(json.dumps(document, indent=2))
     else:
@@ -73,6 +75,9 @@ def _print(document: Mapping[str, Any]) -> None:
         f"process  {process.get('cpu_percent', 0):.0f} % of a core  {process.get('memory_mb', 0):.0f} MB"
         f"  up {process.get('uptime_s', 0):.0f} s"
     )
+    if (agreement := document["agreement"]) is not None:
+        text = agreement_text(agreement)
+        typer.secho(f"maps     {text}", fg="yellow" if agreement["disagreements"] else None)
     rows = [("device", "kind", "state", "rate", "age", "drops", "identity")]
     rows += [_row(source) for source in document["sources"]]
     print_table(rows, [None, *(_LEVEL_COLOURS.get(source["level"]) for source in document["sources"])])
@@ -81,6 +86,20 @@ def _print(document: Mapping[str, Any]) -> None:
         typer.echo("lost     " + ", ".join(lost))
     if newer := [f"{name.partition(_REPLACED)[2]} {count}" for name, count in counters.items() if _REPLACED in name]:
         typer.echo("replaced by newer values before they were sent: " + ", ".join(newer))
+
+
+def agreement_text(agreement: Mapping[str, Any]) -> str:
+    """One line about map/agreement: what contradicts what, and where."""
+    agree = sum(each["agree"] for each in agreement["kinds"])
+    if not agreement["disagreements"]:
+        return f"agree with each other in {agree} things" if agree else "have nothing in common yet"
+    means = {each["kind"]: each["means"] for each in agreement["kinds"]}
+    first = [
+        f"{each['what']} at {each['position'][0]:.1f}, {each['position'][1]:.1f} ({means[each['kind']]})"
+        for each in agreement["where"][:3]
+    ]
+    more = agreement["disagreements"] - len(first)
+    return f"disagree: {'; '.join(first)}" + (f"; and {more} more" if more else "")
 
 
 def _row(source: Mapping[str, Any]) -> tuple[str, str, str, str, str, str, str]:

@@ -60,7 +60,6 @@ class Told:
 @lru_cache(maxsize=1)
 def two_laps() -> Told:
     driving = drive("flat", 2.0)
-    made = robot(driving.truth(0))
     told = Told(RoomMaker(clearance_m=CLEARANCE_M))
 
     def offer(output: Output) -> None:
@@ -68,16 +67,7 @@ def two_laps() -> Told:
         told.documents.append(output)
 
     makers = MapMakers([told.maker], offer, now_ns=lambda: 0)
-    take = made._take
-
-    def also_to_makers(outputs: list[Output]) -> None:
-        take(outputs)
-        for output in outputs:
-            makers.take_output(output)
-        if made.poses:
-            makers.turn(made.poses[-1].stamp_ns)
-
-    made._take = also_to_makers  # type: ignore[method-assign]
+    made = robot(driving.truth(0), makers=makers)
     made.play(driving.items)
     assert makers.counters()["makers.errors"] == 0
     told.end = made.poses[-1].map_from_base

@@ -27,6 +27,7 @@ from service.background import Submit, at_once
 from service.config import Config
 from service.fusion import Fusion, StoredTile
 from service.line_localiser import LineLocaliser
+from service.map_makers import MapMakers, SweepTap
 from service.outputs import DocumentOut, GridOut, GridUpdateOut, Output, PoseOut
 from service.recording import digest_of
 from service.slam_live import SlamLocaliser
@@ -90,9 +91,16 @@ def drive(name: str, laps: float, seed: int = 0) -> Drive:
     plan = load_floor_plan(name)
     assert plan.route is not None
     world, motion = World.from_plan(plan, seed), follow(plan.route)
+    return Drive(world, motion, said(lambda _stamp_s: world, motion, laps * motion.lap_s, seed))
+
+
+def said(
+    world_at: Callable[[float], World], motion: Trajectory, seconds: float, seed: int = 0
+) -> tuple[tuple[str, Reading], ...]:
+    """What the devices say on a way through a world that may change: world_at(stamp_s) is what a sweep sees."""
     rng = np.random.default_rng(seed)
     items: list[tuple[int, str, Reading]] = []
-    stamps = np.arange(0, round(laps * motion.lap_s * 1000), WHEELS_MS)
+    stamps = np.arange(0, round(seconds * 1000), WHEELS_MS)
     at = motion.pose_at(stamps.astype(np.float64) * 1e-3)
     step = relative_poses(at[:-1], at[1:])
     turn = 1.04 * np.array([wrap_angle(float(v)) for v in step[:, 2]])
@@ -106,12 +114,12 @@ def drive(name: str, laps: float, seed: int = 0) -> Drive:
     period_ns = SWEEP_MS * MS / len(BEARING)
     for stamp in range(SCAN_MS, int(stamps[-1]) - SCAN_MS, SCAN_MS):
         beams_s = stamp * 1e-3 + np.arange(len(BEARING), dtype=np.float64) * period_ns * 1e-9
-        reach = seen_m(world, motion.pose_at(beams_s), beams_s)
+        reach = seen_m(world_at(stamp * 1e-3), motion.pose_at(beams_s), beams_s)
         reach = reach + rng.normal(0.0, 0.01, len(reach))
         scan = ScanReading(stamp * MS, period_ns, SCAN_MS * MS, BEARING, reach, 0.05, RANGE_MAX_M)
         items.append(((stamp + SWEEP_MS) * MS, "front", scan))
     items.sort(key=lambda item: item[0])
-    return Drive(world, motion, tuple((source, reading) for _, source, reading in items))
+    return tuple((source, reading) for _, source, reading in items)
 
 
 def seen_m(world: World, bases: F64, stamps_s: F64, mount: Pose2 = MOUNT) -> F64:
@@ -155,6 +163,7 @@ class Robot:
     subscriber: Subscriber = field(default_factory=Subscriber)
     graph: DocumentOut | None = None
     held: int = 0
+    makers: MapMakers | None = None
 
     def play(self, items: Iterable[tuple[str, Reading]]) -> None:
         tick_ns = now_ns = 0
@@ -173,6 +182,14 @@ class Robot:
             self._take(self.fusion.tick(now_ns))
 
     def _take(self, outputs: list[Output]) -> None:
+        self._take_all(outputs)
+        if self.makers is not None:
+            for output in outputs:
+                self.makers.take_output(output)
+            if self.poses:
+                self.makers.turn(self.poses[-1].stamp_ns)
+
+    def _take_all(self, outputs: list[Output]) -> None:
         for output in outputs:
             self.subscriber.take(output)
             if isinstance(output, PoseOut):
@@ -188,16 +205,22 @@ def robot(
     *,
     tiles: Iterable[StoredTile] = (),
     slam: Sequence[StoredTile] = (),
+    makers: MapMakers | None = None,
 ) -> Robot:
+    """makers: maps made beside, as in the daemon; they get sweeps and are told when the map is drawn anew."""
     sensors = assemble.sensors(config)
     maps = assemble.maps(config, sensors)
     for row, col, payload in tiles:
         assert maps.building is not None
         maps.building.grid.load_tile(row, col, payload)
-    localiser = assemble.localiser(config, sensors, maps, start, submit, stored=slam)
+    redraw = None if makers is None else makers.redraw
+    localiser = assemble.localiser(config, sensors, maps, start, submit, redraw, slam)
     assert isinstance(localiser, SlamLocaliser)
     assert maps.building is not None
-    return Robot(Fusion(assemble.parts(config, sensors, maps, localiser)), localiser, maps.building.grid)
+    parts = assemble.parts(config, sensors, maps, localiser)
+    if makers is not None and makers.sources:
+        parts = replace(parts, grids=(*parts.grids, SweepTap(makers, makers.sources)))
+    return Robot(Fusion(parts), localiser, maps.building.grid, makers=makers)
 
 
 def driven(driving: Drive, submit: Submit = at_once) -> Robot:

@@ -1,0 +1,184 @@
+"""One truth, several views: where the grid, the line map and the topological maps contradict each other.
+
+    verdict = walls_in(grid, start_m, end_m)        # one for each wall: AGREES, UNKNOWN or DISAGREES
+
+Nothing is changed by a comparison: each map is right about what it saw last, and which of two is out of date is not
+told here. What one of them does not know is UNKNOWN, never a disagreement. Coordinates are those of the map, metres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mapping.grids.patch import GridPatch
+
+F64 = NDArray[np.float64]
+I8 = NDArray[np.int8]
+I32 = NDArray[np.int32]
+Bools = NDArray[np.bool_]
+
+AGREES, UNKNOWN, DISAGREES = range(3)
+_PASSED_SHARE: Final = 0.5  # the middle part of a passage, between a quarter and three quarters of it
+_ROWS, _COLS = range(2)
+
+
+@dataclass(frozen=True, slots=True)
+class AgreementRules:
+    """When two views contradict each other.
+
+    free_below, occupied_from: per cent, as published.  slack_m: a wall may lie so far beside its occupied cells.
+    depth_m: a passage is blocked by what stands so near its line, in front or behind.  least_m2: of a room has to be
+    occupied that was free when the room was found; a person's legs are less.  share: of what is known has to say so.
+    """
+
+    free_below: int = 35
+    occupied_from: int = 65
+    slack_m: float = 0.1
+    depth_m: float = 0.1
+    least_m2: float = 0.1
+    share: float = 0.5
+
+
+def walls_in(grid: GridPatch, start_m: ArrayLike, end_m: ArrayLike, rules: AgreementRules | None = None) -> I8:
+    """(N,) verdicts: a wall of a line map is occupied in the grid.
+
+    start_m, end_m: (N, 2).  A sample of a wall agrees where a cell within slack_m is occupied, and disagrees where the
+    cell is free and none of those is occupied. A wall is unknown if less than the share of its samples is either.
+    """
+    rules = rules or AgreementRules()
+    owner, at = _along(as_ends(start_m), as_ends(end_m), grid.resolution_m)
+    reach = math.ceil(rules.slack_m / grid.resolution_m)
+    offset = np.arange(-reach, reach + 1)
+    around = np.stack(np.meshgrid(offset, offset, indexing="ij"), axis=-1).reshape(-1, 2)
+    cell = _cells(grid, at)
+    occupied: Bools = np.any(_values(grid, cell[:, None, :] + around[None, :, :]) >= rules.occupied_from, axis=1)
+    own = _values(grid, cell)
+    free = (own >= 0) & (own < rules.free_below) & ~occupied
+    return _verdicts(len(as_ends(start_m)), owner, against=free, for_it=occupied, share=rules.share)
+
+
+def passages_in(grid: GridPatch, ends_m: ArrayLike, rules: AgreementRules | None = None) -> I8:
+    """(N,) verdicts: a passage of a graph is free in the grid, in the middle half of it.
+
+    ends_m: (N, 2, 2) its two ends.  A sample of that half is blocked if a cell within depth_m across is occupied.
+    """
+    rules = rules or AgreementRules()
+    ends = np.asarray(ends_m, dtype=np.float64).reshape(-1, 2, 2)
+    middle, way = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
+    half = 0.5 * _PASSED_SHARE * way
+    owner, at = _along(middle - half, middle + half, 0.5 * grid.resolution_m)
+    across = np.stack((-way[:, 1], way[:, 0]), axis=-1) / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
+    steps = math.ceil(2.0 * rules.depth_m / grid.resolution_m)
+    offset = np.linspace(-rules.depth_m, rules.depth_m, 2 * (steps // 2) + 1)
+    strip = at[:, None, :] + offset[None, :, None] * across[owner][:, None, :]
+    blocked: Bools = np.any(_values(grid, _cells(grid, strip)) >= rules.occupied_from, axis=1)
+    own = _values(grid, _cells(grid, at))
+    free = (own >= 0) & (own < rules.free_below) & ~blocked
+    return _verdicts(len(ends), owner, against=blocked, for_it=free, share=rules.share)
+
+
+def walled_passages(ends_m: ArrayLike, start_m: ArrayLike, end_m: ArrayLike, rules: AgreementRules | None = None) -> I8:
+    """(N,) verdicts: no wall of a line map stands across a passage of a graph, along the middle half of it.
+
+    ends_m: (N, 2, 2).  start_m, end_m: (M, 2) of walls. One bars a passage if it covers half of that part, at most
+    slack_m and depth_m off. A line map that has nothing there may not have looked: never AGREES, only UNKNOWN.
+    """
+    rules = rules or AgreementRules()
+    ends = np.asarray(ends_m, dtype=np.float64).reshape(-1, 2, 2)
+    start, end = as_ends(start_m), as_ends(end_m)
+    verdict = np.full(len(ends), UNKNOWN, dtype=np.int8)
+    way = end - start
+    squared = np.maximum((way * way).sum(axis=1), 1e-12)
+    for k, (a, b) in enumerate(ends):
+        at = a + np.linspace(0.25, 0.75, 11)[:, None] * (b - a)
+        along = np.clip(((at[:, None] - start) * way).sum(axis=-1) / squared, 0.0, 1.0)
+        away = np.hypot(*(at[:, None] - start - along[..., None] * way).transpose(2, 0, 1))
+        barred = (away <= rules.slack_m + rules.depth_m).mean(axis=0) if len(start) else np.zeros(0)
+        level = np.abs(way @ (b - a)) >= math.cos(math.radians(20.0)) * np.sqrt(squared) * math.dist(a, b)
+        if (level & (barred > rules.share)).any():
+            verdict[k] = DISAGREES
+    return verdict
+
+
+def rooms_in(
+    grid: GridPatch, labels: I32, was_free: Bools, row0: int, col0: int, count: int, rules: AgreementRules | None = None
+) -> I8:
+    """(count,) verdicts for rooms 1 to count: what was free of a room when it was found is not occupied.
+
+    labels: (R, C) numbers of rooms, 0 for none.  was_free: (R, C) cells of the grid then.  row0, col0: their place.
+    """
+    rules = rules or AgreementRules()
+    top, left = row0 - grid.row0, col0 - grid.col0
+    height, width = grid.cells.shape
+    now = np.full(labels.shape, -1, dtype=np.int8)
+    into = (
+        slice(max(-top, 0), max(min(height - top, labels.shape[_ROWS]), 0)),
+        slice(max(-left, 0), max(min(width - left, labels.shape[_COLS]), 0)),
+    )
+    if into[0].start < into[0].stop and into[1].start < into[1].stop:
+        now[into] = grid.cells[into[0].start + top : into[0].stop + top, into[1].start + left : into[1].stop + left]
+    counted = np.where(was_free, labels, 0).ravel()
+    occupied = np.bincount(counted, weights=(now >= rules.occupied_from).ravel(), minlength=count + 1)[1 : count + 1]
+    known = np.bincount(counted, weights=(now >= 0).ravel(), minlength=count + 1)[1 : count + 1]
+    verdict = np.where(known > 0, AGREES, UNKNOWN).astype(np.int8)
+    verdict[occupied * grid.resolution_m**2 >= rules.least_m2] = DISAGREES
+    return verdict
+
+
+def points_in(grid: GridPatch, points_m: ArrayLike, rules: AgreementRules | None = None) -> I8:
+    """(N,) verdicts: a place of a topological map, (N, 2), lies in free space."""
+    rules = rules or AgreementRules()
+    value = _values(grid, _cells(grid, np.asarray(points_m, dtype=np.float64).reshape(-1, 2)))
+    verdict = np.full(len(value), UNKNOWN, dtype=np.int8)
+    verdict[(value >= 0) & (value < rules.free_below)] = AGREES
+    verdict[value >= rules.occupied_from] = DISAGREES
+    return verdict
+
+
+def as_ends(points: ArrayLike) -> F64:
+    """(N, 2) float64; ValueError if it is not that or not finite."""
+    given = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    if not np.all(np.isfinite(given)):
+        raise ValueError("points must be finite")
+    return given
+
+
+def _along(start: F64, end: F64, step_m: float) -> tuple[NDArray[np.int64], F64]:
+    """Points about step_m apart on segments: (K,) which segment, (K, 2)."""
+    length = np.hypot(*(end - start).T)
+    count = np.maximum(np.ceil(length / step_m).astype(np.int64), 1)
+    owner = np.repeat(np.arange(len(start)), count)
+    first = np.repeat(np.cumsum(count) - count, count)
+    share = (np.arange(len(owner)) - first + 0.5) / count[owner]
+    return owner, start[owner] + share[:, None] * (end - start)[owner]
+
+
+def _cells(grid: GridPatch, points_m: F64) -> NDArray[np.int64]:
+    """[row, col] in the patch; they may lie outside."""
+    whole = np.floor(points_m[..., ::-1] / grid.resolution_m).astype(np.int64)
+    return np.asarray(whole - (grid.row0, grid.col0))
+
+
+def _values(grid: GridPatch, cells: NDArray[np.int64]) -> I8:
+    """What the grid says of cells (..., 2); -1 outside."""
+    rows, cols = cells[..., _ROWS], cells[..., _COLS]
+    height, width = grid.cells.shape
+    inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+    found = (
+        grid.cells[np.where(inside, rows, 0), np.where(inside, cols, 0)] if grid.cells.size else np.zeros(rows.shape)
+    )
+    return np.where(inside, found, -1).astype(np.int8)
+
+
+def _verdicts(count: int, owner: NDArray[np.int64], *, against: Bools, for_it: Bools, share: float) -> I8:
+    samples = np.bincount(owner, minlength=count)
+    no, yes = (np.bincount(owner, weights=each, minlength=count) for each in (against, for_it))
+    verdict = np.full(count, UNKNOWN, dtype=np.int8)
+    judged = (samples > 0) & (no + yes >= share * samples)
+    verdict[judged] = np.where(no[judged] > share * (no + yes)[judged], DISAGREES, AGREES)
+    return verdict
