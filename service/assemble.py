@@ -599,6 +599,8 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         topo = config.topo
         period_ns = round(topo.period_s * 1e9)
         makers.append(TopoMaker(period_ns=period_ns, smooth_m=topo.smooth_m, door_m=topo.door_m))
+    if config.places.enabled:
+        makers.extend(_place_maker(config, found))
     if config.scenes.enabled and (fed_by := lasers & _sources(config, config.scenes.sources, found)):
         from service.scene_maker import SceneMaker
 
@@ -646,6 +648,19 @@ def _agreement_maker(config: Config, makers: Sequence[MapMaker], lasers: frozens
         sources=lasers,
         period_ns=round(config.agreement.period_s * 1e9),
     )
+
+
+def _place_maker(config: Config, found: Mapping[str, Sensor]) -> Iterator[MapMaker]:
+    """None without a laser that looks level."""
+    from service.place_maker import PlaceMaker
+
+    lasers = {name: each for name, each in found.items() if isinstance(each, Laser) and not each.tilts}
+    if config.places.source is not None:
+        wanted = config.source_name(*config.resolve(config.places.source))
+        lasers = {name: each for name, each in lasers.items() if name == wanted}
+    for name in sorted(lasers)[:1]:
+        period_ns = round(config.places.period_s * 1e9)
+        yield PlaceMaker(name, lasers[name].base_from_sensor, period_ns=period_ns)
 
 
 def _has_rooms(config: Config, found: Mapping[str, Sensor]) -> bool:

@@ -43,6 +43,7 @@ from service.config_maps import (
     LineMapSettings,
     LocalGrid,
     LocaliseIn,
+    PlaceMapSettings,
     PlaneMapSettings,
     RoomMapSettings,
     SceneMapSettings,
@@ -78,6 +79,7 @@ class Config(Section):
     elevation: ElevationSettings = Field(default=ElevationSettings(), description="Heights of the ground around.")
     clearance: ClearanceSettings = Field(default=ClearanceSettings(), description="Distances to obstacles.")
     topo: TopoMapSettings = Field(default=TopoMapSettings(), description="Regions of free space and ways between them.")
+    places: PlaceMapSettings = Field(default=PlaceMapSettings(), description="Places and hallways.")
     scenes: SceneMapSettings = Field(default=SceneMapSettings(), description="Scenes to be recognised again.")
     rooms: RoomMapSettings = Field(default=RoomMapSettings(), description="Rooms, doors, plans.")
     agreement: AgreementSettings = Field(default=AgreementSettings(), description="Maps held against each other.")
@@ -368,6 +370,9 @@ def _unused_faults(config: Config, data: Mapping[str, Any]) -> Iterator[Fault]:
             yield Fault(("poses", name), f'no drive uses it; add pose_source = "{name}" to [drive]')
     if config.rings and config.topo.enabled:
         yield Fault(("topo", "enabled"), "map/topo is what the ring makes; leave [topo] out, or [rings.NAME]")
+    if config.places.enabled and (config.topo.enabled or config.rings):
+        other = "[topo]" if config.topo.enabled else "[rings.NAME]"
+        yield Fault(("places", "enabled"), f"map/topo is one map, and {other} makes it; leave one of the two out")
     if len(config.rings) > 1:
         yield Fault(("rings", sorted(config.rings)[1]), "a robot has one ring: map/topo is one map")
     polar = _table(data, "sectors", "polar")

@@ -171,6 +171,14 @@ class TopoMapSettings(Section):
     door_m: float = Field(default=1.3, ge=0.1, le=10.0, description="Wider passages join regions to one room.")
 
 
+class PlaceMapSettings(Section):
+    """Places with local maps and hallways between them, without a common frame: key map/topo, call @rpc/route."""
+
+    enabled: bool = Field(default=False, description="Keep it; [topo] has the same key.")
+    source: Reference | None = Field(default=None, description="The laser that sees them; default: the first by name.")
+    period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two that are published.")
+
+
 class SceneMapSettings(Section):
     """Scenes to be recognised again: key map/scenes, call @rpc/where_am_i."""
 

@@ -9,18 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2, wrap_angle
-from mapping.lines.extract import LineExtractor, LineRules, are_in_order, extract_from_points
+from mapping.lines.extract import LineRules
 from mapping.lines.line_map import LineMap
-from mapping.lines.lines import Lines, no_lines
+from mapping.lines.lines import Lines
 from mapping.scan import Scan
 from service.map_makers import MapView, Tile
 from service.outputs import DocumentOut, Output
+from service.sweep_lines import SweepLines, middle_of
 
 F64 = NDArray[np.float64]
 
 KEY = "map/lines"
-_STILL_M = 1e-3
-_STILL_RAD = 2e-4
 _NANOS = 1_000_000_000
 
 
@@ -70,8 +69,7 @@ class LineMaker:
         self.sources = frozenset(sources)
         self.period_ns = period_ns
         self._min_seen, self._step_m, self._step_rad = min_seen, step_m, step_rad
-        self._rules = rules or LineRules()
-        self._extractors: dict[str, tuple[F64, LineExtractor]] = {}
+        self._sweep_lines = SweepLines(rules)
         self._last: dict[str, Pose2] = {}
         self._told_version = 0
         self._kept_version = 0
@@ -80,10 +78,10 @@ class LineMaker:
         """Add one sweep's lines. map_from_sensor: (N, 3) the pose of every beam, or (3,) one for all; a sweep of which
         a pose is not known is left out."""
         poses = np.atleast_2d(np.asarray(map_from_sensor, dtype=np.float64))
-        middle = Pose2(*(float(v) for v in poses[len(poses) // 2]))
+        middle = middle_of(poses)
         if not np.all(np.isfinite(poses)) or not self._has_moved(source, middle):
             return
-        lines = self._lines(source, scan, poses, middle)
+        lines = self._sweep_lines.of(source, scan, poses)
         if len(lines):
             self._last[source] = middle
             self.line_map.insert(lines, middle)
@@ -130,31 +128,3 @@ class LineMaker:
             return True
         way = math.hypot(pose.x_m - last.x_m, pose.y_m - last.y_m)
         return way >= self._step_m or abs(wrap_angle(pose.yaw_rad - last.yaw_rad)) >= self._step_rad
-
-    def _lines(self, source: str, scan: Scan, poses: F64, middle: Pose2) -> Lines:
-        """Of a standing sensor by its beams, of a moving one by its points, seen from where it was midway."""
-        in_order = are_in_order(scan.bearing_rad)
-        place, yaw = np.abs(poses[:, :2] - poses[0, :2]).max(), np.abs(poses[:, 2] - poses[0, 2]).max()
-        if in_order and place < _STILL_M and yaw < _STILL_RAD:
-            return self._extractor(source, scan).extract(scan.range_m)
-        seen = np.isfinite(scan.range_m) & (scan.range_m > 0.0) & (scan.range_m <= scan.range_max_m)
-        if np.count_nonzero(seen) < 2:
-            return no_lines()
-        at, r = poses[seen], scan.range_m[seen]
-        angle = scan.bearing_rad[seen] + at[:, 2]
-        points = middle.inverse().apply(at[:, :2] + r[:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1))
-        if not in_order:
-            points = points[np.argsort(np.arctan2(points[:, 1], points[:, 0]), kind="stable")]
-        elif scan.bearing_rad[0] > scan.bearing_rad[-1]:
-            points = points[::-1]
-        spacing = float(np.median(np.abs(np.diff(scan.bearing_rad))))
-        return extract_from_points(points, self._rules, spacing_rad=spacing)
-
-    def _extractor(self, source: str, scan: Scan) -> LineExtractor:
-        """Kept while the device's bearings stay the same."""
-        known = self._extractors.get(source)
-        if known is not None and (known[0] is scan.bearing_rad or np.array_equal(known[0], scan.bearing_rad)):
-            return known[1]
-        made = LineExtractor(scan.bearing_rad, self._rules, range_min_m=scan.range_min_m, range_max_m=scan.range_max_m)
-        self._extractors[source] = (scan.bearing_rad, made)
-        return made

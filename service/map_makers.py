@@ -104,6 +104,14 @@ class DrawnFromSweeps(Protocol):
 
 
 @runtime_checkable
+class TellsMotion(Protocol):
+    """A maker that takes from the poses of sweeps how the robot moved."""
+
+    def map_moved(self) -> None:
+        """The map was corrected: between the last sweep and the next the pose jumps."""
+
+
+@runtime_checkable
 class MadeOfClouds(Protocol):
     """A maker that also wants the clouds of tilting lasers."""
 
@@ -305,6 +313,8 @@ class MapMakers:
             if redrawn is not None and isinstance(desk.maker, DrawnFromSweeps):
                 desk.is_fed = True
                 self._guard(desk, partial(_draw_anew, desk.maker, redrawn))
+            if redrawn is not None and isinstance(desk.maker, TellsMotion):
+                self._guard(desk, desk.maker.map_moved)
         for output in grids:
             self._note(self._mirror.take(output))
         for desk in self._desks:

@@ -300,7 +300,7 @@ MAP_TOPO = Topic(
     "umfeld.topo.v1",
     JSON_TOPO,
     "at most every 5 s, on change",
-    "Regions of free space and the passages between them, or places and the ways driven; if configured.",
+    "Regions of free space and passages, or places and the ways driven, or places and hallways; if configured.",
     Priority.DATA_LOW,
     cached=True,
     lane=Lane.MAP,

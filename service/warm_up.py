@@ -83,6 +83,10 @@ def _steps(config: Config) -> dict[str, Step]:
         from mapping.planes.warm_up import warm_up as warm_up_planes
 
         steps["planes"] = warm_up_planes
+    if "places" in names:
+        from service.place_maker import warm_up as warm_up_places
+
+        steps["places"] = warm_up_places
     if "scenes" in names:
         from mapping.features.warm_up import warm_up as warm_up_features
 
