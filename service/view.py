@@ -29,7 +29,10 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",
 }
-_FILES = {"/": "index.html", "/page.js": "page.js", "/cdr.js": "cdr.js", "/draw.js": "draw.js", "/page.css": "page.css"}
+_FILES = {
+    "/": "index.html",
+    **{f"/{name}": name for name in ("page.js", "cdr.js", "draw.js", "overlays.js", "page.css")},
+}
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 _SEND_TIMEOUT_S = 10.0
 PAGES_MAX = 32

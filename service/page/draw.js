@@ -4,7 +4,7 @@ const css = (name) => getComputedStyle(document.documentElement).getPropertyValu
 
 const NAMES = ["--map-unknown", "--map-free", "--map-wall", "--scan", "--cone", "--trail", "--robot", "--ink", "--soft", "--rule",
   "--sector-free", "--sector-obstacle", "--sector-unknown", "--sector-stale"];
-let colours = {};
+export let colours = {};
 export function readColours() { colours = Object.fromEntries(NAMES.map((name) => [name.slice(2), css(name)])); }
 readColours();
 
@@ -111,17 +111,21 @@ export class GridImage {
   }
   draw(g2, camera) {
     if (!this.grid) return;
-    const { origin, resolution } = this.grid;
-    const [px, py] = camera.toScreen(origin.x, origin.y);
-    const k = camera.scale * resolution;
-    g2.save();
-    g2.translate(px, py);
-    g2.rotate(-origin.yaw);
-    g2.scale(k, -k);
-    g2.imageSmoothingEnabled = k < 1;
-    g2.drawImage(this.canvas, 0, 0);
-    g2.restore();
+    drawRaster(g2, camera, this.canvas, this.grid.origin, this.grid.resolution);
   }
+}
+
+// Cells as an image, its row 0 the lowest of the map, where origin puts its corner.
+export function drawRaster(g2, camera, canvas, origin, resolution) {
+  const [px, py] = camera.toScreen(origin.x, origin.y);
+  const k = camera.scale * resolution;
+  g2.save();
+  g2.translate(px, py);
+  g2.rotate(-origin.yaw);
+  g2.scale(k, -k);
+  g2.imageSmoothingEnabled = k < 1;
+  g2.drawImage(canvas, 0, 0);
+  g2.restore();
 }
 
 export function clearMap(g2, camera) {

@@ -2,6 +2,7 @@
 
 import * as cdr from "./cdr.js";
 import * as draw from "./draw.js";
+import * as overlays from "./overlays.js";
 
 const $ = (id) => document.getElementById(id);
 const TEXT = new TextDecoder();
@@ -25,6 +26,10 @@ class Robot {
     this.topo = null;
     this.rooms = null;
     this.plan = null;
+    this.lines = null;
+    this.ground = null; // images
+    this.clearance = null;
+    this.agreement = null;
     this.seen = new Map(); // when a device's newest reading came here
   }
 
@@ -64,7 +69,12 @@ const robots = new Map();
 let shown = null;
 let changed = true;
 const camera = new draw.Camera($("map"));
-const layers = { grid: true, scan: true, sonar: true, sectors: true, trail: true, loops: true, topo: true, rooms: true };
+const layers = { grid: true, scan: true, sonar: true, sectors: true, trail: true, loops: true, topo: true, rooms: true, plan: true,
+  lines: false, ground: true, clearance: false, conflicts: true };
+const buttons = new Map();
+// Layers that not every robot has: their buttons come with their maps.
+const HAS = { loops: (r) => r.graph, topo: (r) => r.topo, rooms: (r) => r.rooms, plan: (r) => r.plan, lines: (r) => r.lines, ground: (r) => r.ground,
+  clearance: (r) => r.clearance, conflicts: (r) => r.agreement, sonar: (r) => r.cones.size > 0 };
 let follow = false;
 let ringMap = null;
 
@@ -106,6 +116,10 @@ const HANDLERS = [
   [/^map\/topo$/, (robot, payload) => { robot.topo = json(payload); }],
   [/^map\/rooms$/, (robot, payload) => { robot.rooms = json(payload); }],
   [/^map\/plan$/, (robot, payload) => { robot.plan = json(payload); }],
+  [/^map\/lines$/, (robot, payload) => { robot.lines = json(payload); }],
+  [/^map\/elevation$/, (robot, payload) => { robot.ground = overlays.groundImage(json(payload)); }],
+  [/^map\/clearance$/, (robot, payload) => { robot.clearance = overlays.clearanceImage(cdr.occupancyGrid(payload)); }],
+  [/^map\/agreement$/, (robot, payload) => takeAgreement(robot, json(payload))],
   [/^health\/json$/, (robot, payload) => takeHealth(robot, json(payload))],
   [/^info$/, (robot, payload) => { robot.info = json(payload); }],
 ];
@@ -163,6 +177,17 @@ function takeHealth(robot, health) {
   }
   robot.health = health;
   robot.healthAt = performance.now();
+}
+
+function begun(doc) { return (doc?.kinds ?? []).reduce((sum, kind) => sum + kind.began, 0); }
+
+function where(doc) { return doc.where.map((each) => `${each.what} at ${each.position.map((v) => v.toFixed(1)).join(", ")}`); }
+
+function takeAgreement(robot, doc) {
+  const before = robot.agreement;
+  robot.agreement = doc;
+  if (before && doc.disagreements && begun(doc) > begun(before)) note(1, `maps disagree: ${where(doc).slice(0, 2).join("; ")}`);
+  else if (before?.disagreements && !doc.disagreements) note(0, "maps agree again");
 }
 
 // ---- the parts around the map ------------------------------------------------------------------------------------
@@ -236,6 +261,21 @@ function drawPanel(robot) {
     }
     cards.push(box);
   }
+  const doc = robot?.agreement;
+  if (doc) {
+    const box = element("article", "", { className: "card" });
+    box.dataset.level = doc.disagreements ? 1 : 0;
+    const title = element("h2", "maps");
+    title.append(element("small", doc.disagreements ? "disagree" : "agree"));
+    box.append(title);
+    for (const text of where(doc).slice(0, 4)) box.append(element("p", text));
+    const list = element("dl");
+    for (const [label, field] of [["agree", "agree"], ["unknown", "unknown"], ["disagree", "disagree"]]) {
+      figure(list, label, String(doc.kinds.reduce((sum, kind) => sum + kind[field], 0)), field === "disagree" && doc.disagreements ? "age-late" : "");
+    }
+    box.append(list);
+    cards.push(box);
+  }
   const dropped = Object.entries(robot?.health?.counters ?? {}).filter(([, n]) => n > 0);
   if (dropped.length) {
     const box = element("article", "", { className: "card" });
@@ -249,6 +289,10 @@ function drawPanel(robot) {
 function ringName(robot) {
   if (ringMap && robot?.polar.has(ringMap)) return ringMap;
   return robot ? [...robot.polar.keys()].sort()[0] ?? null : null;
+}
+
+function showButtons(robot) {
+  for (const [name, has] of Object.entries(HAS)) buttons.get(name).hidden = !(robot && has(robot));
 }
 
 function drawHeader(robot) {
@@ -291,7 +335,10 @@ function drawMap(robot) {
   frameWhenKnown(robot);
   if (follow && robot.pose) { camera.x = robot.pose.x; camera.y = robot.pose.y; }
   if (layers.grid) robot.grid.draw(g2, camera);
+  if (layers.ground && robot.ground) overlays.drawOverlay(g2, camera, robot.ground);
+  if (layers.clearance && robot.clearance) overlays.drawOverlay(g2, camera, robot.clearance);
   if (layers.rooms && robot.rooms) draw.drawRooms(g2, camera, robot.rooms);
+  if (layers.lines && robot.lines) overlays.drawLines(g2, camera, robot.lines);
   if (layers.trail) {
     if (robot.graph) draw.drawTrail(g2, camera, robot.graph.keys.map(([x, y]) => ({ x, y })));
     draw.drawTrail(g2, camera, robot.trail);
@@ -302,7 +349,8 @@ function drawMap(robot) {
     const [x, y, yaw] = robot.topo.robot ?? [];
     if (!robot.pose && yaw !== undefined) draw.drawRobot(g2, camera, { x, y, yaw }, robot.footprint);
   }
-  if (layers.rooms && robot.plan) draw.drawPlan(g2, camera, robot.plan);
+  if (layers.plan && robot.plan) draw.drawPlan(g2, camera, robot.plan);
+  if (layers.conflicts && robot.agreement) overlays.drawDisagreements(g2, camera, robot.agreement);
   if (robot.pose) {
     if (layers.sonar) drawCones(g2, robot);
     if (layers.scan) drawScans(g2, robot);
@@ -419,7 +467,8 @@ setPanel(window.innerWidth > 720);
 
 for (const name of Object.keys(layers)) {
   const button = element("button", name);
-  button.setAttribute("aria-pressed", "true");
+  button.setAttribute("aria-pressed", String(layers[name]));
+  buttons.set(name, button);
   button.onclick = () => { layers[name] = !layers[name]; button.setAttribute("aria-pressed", String(layers[name])); changed = true; };
   $("layers").append(button);
 }
@@ -449,7 +498,7 @@ function connect() {
   socket.onclose = () => { online = false; setTimeout(connect, 1000); };
 }
 
-setInterval(() => { const robot = robots.get(shown) ?? null; drawHeader(robot); drawPanel(robot); }, 250);
+setInterval(() => { const robot = robots.get(shown) ?? null; drawHeader(robot); drawPanel(robot); showButtons(robot); }, 250);
 connect();
 requestAnimationFrame(frame);
 window.umfeld = { robots, camera }; // for tests and for the curious at the browser's console

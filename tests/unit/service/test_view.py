@@ -30,7 +30,7 @@ def split(message: bytes) -> tuple[str, bytes]:
     return message[2 : 2 + length].decode(), message[2 + length + 3 :]
 
 
-@pytest.mark.parametrize("path", ["/", "/page.js", "/cdr.js", "/draw.js", "/page.css"])
+@pytest.mark.parametrize("path", ["/", "/page.js", "/cdr.js", "/draw.js", "/overlays.js", "/page.css"])
 def test_every_file_of_the_page_is_served_and_nothing_from_outside_allowed(path: str) -> None:
     async def task(_relay: Relay, client: TestClient) -> None:  # type: ignore[type-arg]
         reply = await client.get(path)
