@@ -31,13 +31,15 @@ _ROWS, _COLS = range(2)
 class AgreementRules:
     """When two views contradict each other.
 
-    free_below, occupied_from: per cent, as published.  slack_m: a wall may lie so far beside its occupied cells.
+    free_below, occupied_from: per cent, as published.  blocked_from: of a passage or room that was free, which takes
+    time to fill up: more likely occupied than not.  slack_m: a wall may lie so far beside its occupied cells.
     depth_m: a passage is blocked by what stands so near its line, in front or behind.  least_m2: of a room has to be
     occupied that was free when the room was found; a person's legs are less.  share: of what is known has to say so.
     """
 
     free_below: int = 35
     occupied_from: int = 65
+    blocked_from: int = 51
     slack_m: float = 0.1
     depth_m: float = 0.1
     least_m2: float = 0.1
@@ -65,7 +67,8 @@ def walls_in(grid: GridPatch, start_m: ArrayLike, end_m: ArrayLike, rules: Agree
 def passages_in(grid: GridPatch, ends_m: ArrayLike, rules: AgreementRules | None = None) -> I8:
     """(N,) verdicts: a passage of a graph is free in the grid, in the middle half of it.
 
-    ends_m: (N, 2, 2) its two ends.  A sample of that half is blocked if a cell within depth_m across is occupied.
+    ends_m: (N, 2, 2) its two ends.  A sample of that half is blocked if a cell within depth_m across is
+    more likely occupied than not.
     """
     rules = rules or AgreementRules()
     ends = np.asarray(ends_m, dtype=np.float64).reshape(-1, 2, 2)
@@ -76,7 +79,7 @@ def passages_in(grid: GridPatch, ends_m: ArrayLike, rules: AgreementRules | None
     steps = math.ceil(2.0 * rules.depth_m / grid.resolution_m)
     offset = np.linspace(-rules.depth_m, rules.depth_m, 2 * (steps // 2) + 1)
     strip = at[:, None, :] + offset[None, :, None] * across[owner][:, None, :]
-    blocked: Bools = np.any(_values(grid, _cells(grid, strip)) >= rules.occupied_from, axis=1)
+    blocked: Bools = np.any(_values(grid, _cells(grid, strip)) >= rules.blocked_from, axis=1)
     own = _values(grid, _cells(grid, at))
     free = (own >= 0) & (own < rules.free_below) & ~blocked
     return _verdicts(len(ends), owner, against=blocked, for_it=free, share=rules.share)
@@ -123,7 +126,7 @@ def rooms_in(
     if into[0].start < into[0].stop and into[1].start < into[1].stop:
         now[into] = grid.cells[into[0].start + top : into[0].stop + top, into[1].start + left : into[1].stop + left]
     counted = np.where(was_free, labels, 0).ravel()
-    occupied = np.bincount(counted, weights=(now >= rules.occupied_from).ravel(), minlength=count + 1)[1 : count + 1]
+    occupied = np.bincount(counted, weights=(now >= rules.blocked_from).ravel(), minlength=count + 1)[1 : count + 1]
     known = np.bincount(counted, weights=(now >= 0).ravel(), minlength=count + 1)[1 : count + 1]
     verdict = np.where(known > 0, AGREES, UNKNOWN).astype(np.int8)
     verdict[occupied * grid.resolution_m**2 >= rules.least_m2] = DISAGREES

@@ -50,7 +50,7 @@ export function drawLines(g2, camera, doc) {
 
 // map/agreement: a ring with a mark at each place where one map denies what another says.
 export function drawDisagreements(g2, camera, doc) {
-  g2.strokeStyle = g2.fillStyle = colours["sector-stale"];
+  g2.strokeStyle = colours["sector-obstacle"];
   g2.lineWidth = 2.5;
   g2.font = "bold 14px sans-serif";
   g2.textAlign = "center";
@@ -58,7 +58,10 @@ export function drawDisagreements(g2, camera, doc) {
     const [px, py] = camera.toScreen(...position);
     g2.beginPath();
     g2.arc(px, py, 10, 0, 2 * Math.PI);
+    g2.fillStyle = colours["map-free"];
+    g2.fill();
     g2.stroke();
+    g2.fillStyle = colours["sector-obstacle"];
     g2.fillText("!", px, py + 5);
   }
 }
