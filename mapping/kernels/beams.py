@@ -1,4 +1,7 @@
-"""Compiled loops over the beams of one sweep, before anything is drawn from it."""
+"""Compiled loops over the beams of one sweep, before anything is drawn from it.
+
+Short: they keep the interpreter's lock, see sectors.py.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,14 @@ from mapping.kernels.sectors import point_in_polygon
 TWO_PI = 2.0 * math.pi
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def angle_between(a: float, b: float) -> float:
     """How far two bearings are apart, 0 to pi."""
     turn = abs(a - b) % TWO_PI
     return min(turn, TWO_PI - turn)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def goes_on(r: float, r_next: float, r_second: float, turn: float, turn_on: float, off_m: float) -> bool:
     """Whether a beam of length r ends on the straight wall through the ends of the next two to one side."""
     if not (r_second > 0.0 and math.isfinite(r_second) and turn_on > 0.0):
@@ -34,7 +37,7 @@ def goes_on(r: float, r_next: float, r_second: float, turn: float, turn_on: floa
     return bool(inverse > 0.0 and abs(r - 1.0 / inverse) <= off)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def drop_mixed(
     bearing: Any, distance: Any, cot_grazing: float, step_m: float, off_m: float, widest: float, kept: Any
 ) -> int:
@@ -83,7 +86,7 @@ def drop_mixed(
     return dropped
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def drop_own(
     bearing: Any, distance: Any, x_m: float, y_m: float, yaw_rad: float, polygon: Any, too_close_m: float, kept: Any
 ) -> int:

@@ -25,7 +25,7 @@ FIRST, WIDTH, BINS, CLOSED = 0, 1, 2, 3
 NEIGHBOURS = 8  # points on either side that may define a normal
 WIDEST_BINS = 24.0  # half of the widest window of bearings that is searched
 ASIDE_SLACK_RAD = 1e-4  # more than bearing_of and the rounding of points are off
-FARTHEST_ASIDE_RAD = 1.4  # up to where a - a^3 / 6 grows
+FARTHEST_ASIDE_RAD = 1.4
 FACING = 0.6  # cosine: surfaces that meet under a larger angle are not the same one
 
 LEVELS = 4
@@ -167,14 +167,16 @@ def nearest_bin(px: float, py: float, reach_m: float, coarse: bool, x: Any, y: A
     """The bin of a view whose point with a normal lies nearest to (px, py), within reach_m; -1 if none does.
 
     Points within reach lie within asin(reach / range) of its bearing. coarse: every other bin of wide windows only.
-    Bins are looked at from the point's own bearing outwards: what lies `a` radians aside is at least r sin(a) away, and
-    a - a^3 / 6 is less than sin(a). Of points that are equally near, that of the lowest bin counts.
+    Bins are looked at from the point's own bearing outwards, on both sides in turn: what lies `a` radians aside is at
+    least r sin(a) away, and sin(a) at least a (1 - h^2 / 6) up to the window's half h. Of points that are equally near,
+    that of the lowest bin counts.
     """
     bins = int(frame[BINS])
+    width = frame[WIDTH]
     r = math.sqrt(px * px + py * py)
     half = WIDEST_BINS
     if r > reach_m:
-        half = min(half, 1.05 * reach_m / (r * frame[WIDTH]) + 0.5)
+        half = min(half, 1.05 * reach_m / (r * width) + 0.5)
     middle = bin_of(bearing_of(px, py), frame)
     low, high = middle - int(half), middle + int(half)
     first = low
@@ -182,16 +184,19 @@ def nearest_bin(px: float, py: float, reach_m: float, coarse: bool, x: Any, y: A
         low, high = max(low, 0), min(high, bins - 1)
         first = low
     step = 2 if coarse and half > 5.0 else 1
-    begin = first + (min(max(middle, first), high) - first) // step * step  # down from here, up from the next
+    down = first + (min(max(middle, first), high) - first) // step * step
+    up = down + step
+    widest = min((half + 1.0) * width, FARTHEST_ASIDE_RAD)
+    per_rad = r * (1.0 - widest * widest / 6.0)
+    aside = -width - ASIDE_SLACK_RAD
     best, at, at_k = reach_m * reach_m, -1, 0
-    for side in (-1, 1):
-        k = begin if side < 0 else begin + step
-        while low <= k <= high:
-            aside = min((abs(k - middle) - 1) * frame[WIDTH] - ASIDE_SLACK_RAD, FARTHEST_ASIDE_RAD)
-            if aside > 0.0:
-                apart = r * aside * (1.0 - aside * aside / 6.0)
-                if apart * apart > best:
-                    break
+    while down >= low or up <= high:
+        apart = per_rad * min(aside, FARTHEST_ASIDE_RAD)
+        if apart > 0.0 and apart * apart > best:
+            break
+        for k in (down, up):
+            if k < low or k > high:
+                continue
             b = k
             if b < 0:
                 b += bins
@@ -202,7 +207,9 @@ def nearest_bin(px: float, py: float, reach_m: float, coarse: bool, x: Any, y: A
                 square = dx * dx + dy * dy
                 if square < best or (square == best and at >= 0 and k < at_k):
                     best, at, at_k = square, b, k
-            k += side * step
+        down -= step
+        up += step
+        aside += step * width
     return at
 
 
@@ -219,6 +226,7 @@ def add_pair(
     """
     c, s = math.cos(turn), math.sin(turn)
     square = scale_m * scale_m
+    h0, h1, h2, h3, h4, h5, g0, g1, g2, cost, count = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(offset, len(sx), stride):
         if squality[i] == EMPTY:
             continue
@@ -234,17 +242,19 @@ def add_pair(
         inside = square / (square + e * e)
         w = quality[b] * inside * inside
         j = rx * uy - ry * ux
-        sums[0] += w * ux * ux
-        sums[1] += w * ux * uy
-        sums[2] += w * ux * j
-        sums[3] += w * uy * uy
-        sums[4] += w * uy * j
-        sums[5] += w * j * j
-        sums[6] += w * ux * e
-        sums[7] += w * uy * e
-        sums[8] += w * j * e
-        sums[9] += 1.0 - inside
-        sums[10] += 1.0
+        h0 += w * ux * ux
+        h1 += w * ux * uy
+        h2 += w * ux * j
+        h3 += w * uy * uy
+        h4 += w * uy * j
+        h5 += w * j * j
+        g0 += w * ux * e
+        g1 += w * uy * e
+        g2 += w * j * e
+        cost += 1.0 - inside
+        count += 1.0
+    for at, value in enumerate((h0, h1, h2, h3, h4, h5, g0, g1, g2, cost, count)):
+        sums[at] += value
 
 
 @njit(cache=True, nogil=True)

@@ -1,4 +1,7 @@
-"""Compiled loops about a sensor that moves while it measures: a pose for every beam, the sweep as of one instant."""
+"""Compiled loops about a sensor that moves while it measures: a pose for every beam, the sweep as of one instant.
+
+Short: they keep the interpreter's lock, see sectors.py.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,13 @@ TWO_PI = 2.0 * math.pi
 SMALL_RAD = 1e-6
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def wrapped(angle: float) -> float:
     """The same angle in [-pi, pi)."""
     return (angle + math.pi) % TWO_PI - math.pi
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def arc_coefficients(w: float) -> tuple[float, float]:
     """sin(w)/w and (1 - cos(w))/w, by series near 0."""
     if abs(w) < SMALL_RAD:
@@ -26,7 +29,7 @@ def arc_coefficients(w: float) -> tuple[float, float]:
     return math.sin(w) / w, (1.0 - math.cos(w)) / w
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def poses_at(asked: Any, stamps: Any, pose: Any, stretch: Any, found: Any) -> bool:
     """Poses at asked times (N,) along arcs of constant twist between the two poses around each, into found (N, 3).
 
@@ -61,7 +64,7 @@ def poses_at(asked: Any, stamps: Any, pose: Any, stretch: Any, found: Any) -> bo
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def along_arc(start: Any, end: Any, share: Any) -> Any:
     """(N, 3) poses at shares (N,) of the way from one pose (3,) to another along the arc of constant twist."""
     found = np.empty((len(share), 3))
@@ -81,7 +84,7 @@ def along_arc(start: Any, end: Any, share: Any) -> Any:
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def carried(pose: Any, x: float, y: float, yaw: float) -> Any:
     """(N, 3) poses a_from_c of many a_from_b (N, 3) and one b_from_c; yaw is not wrapped."""
     moved = np.empty_like(pose)
@@ -93,7 +96,7 @@ def carried(pose: Any, x: float, y: float, yaw: float) -> Any:
     return moved
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def seen_at_once(
     sensor: Any, ref_x: float, ref_y: float, ref_yaw: float, bearing: Any, distance: Any
 ) -> tuple[Any, Any, Any]:
@@ -117,7 +120,7 @@ def seen_at_once(
     return new_bearing, new_distance, origin
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def rolled_covariance(
     covariance: Any, yaw: float, way: float, turn: float, track: float, left_var: float, right_var: float
 ) -> Any:
@@ -152,7 +155,7 @@ def rolled_covariance(
     return moved
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def beam_lines(
     pose: Any, bearing: Any, distance: Any, range_min: float, range_max: float, reach: float, clear_no_return: bool
 ) -> tuple[Any, Any, Any, Any]:
