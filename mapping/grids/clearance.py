@@ -103,10 +103,9 @@ class DistanceField:
             self._columns = np.zeros((self.shape[1], (self.shape[0] + 63) // 64), dtype=np.uint64)
             self._count = kernels.column_bits(self._obstacle, self._columns)
         if self._half is not None:
-            near = np.zeros((self.shape[0], (self.shape[1] + 31) // 32), dtype=np.uint8)
             kept = (self._obstacle, self._columns, self.squared, self.site, self._spans)
             kernels.add_within(new, self._half, *kept)
-            kernels.remove_within(lost, self._half, near, *kept, *self._work)
+            kernels.remove_within(lost, np.empty((len(lost), 3), dtype=np.int32), self._half, *kept, *self._work)
             return self._spans
         self._count += len(new) - len(lost)
         if self._count == len(new) or self._count == 0:

@@ -11,8 +11,8 @@ row, away from the obstacle, until its Voronoi region (which is convex) has ende
 steps for each row in which that region is alive.
 
 With a reach, distances beyond it are not kept: such cells have FAR and NO_SITE. Then what one obstacle rules lies in a
-disc; a new one is held against every cell of it, and after losses the blocks within reach of them are looked through
-for cells without an obstacle. Work: the discs, whatever the size of the map.
+disc, less what its neighbours rule: a new one is held against every cell there, and where a lost one ruled is filled
+anew. Work: the discs at most, whatever the size of the map.
 
     obstacle (R, C) uint8    columns (C, W) uint64, bit r of a column's W words: an obstacle in row r
     squared  (R, C) int32    FAR where there is no obstacle at all
@@ -32,7 +32,6 @@ NO_ROW = -30_000  # in `nearest_row`: no obstacle in this column; its distance e
 _NONE_BELOW = 90_000
 MAX_SIDE = 20_000  # squares of distances fit 32 bits, rows and columns 16
 UNLIMITED = 1 << 15  # a reach that no distance exceeds: its square is FAR
-_BLOCK_BITS = 5  # columns that are looked through together
 
 
 @njit(cache=True, nogil=True)
@@ -496,47 +495,39 @@ def add_within(new: Any, half: Any, obstacle: Any, columns: Any, squared: Any, s
 
 @njit(cache=True, nogil=True)
 def remove_within(
-    lost: Any, half: Any, near: Any, obstacle: Any, columns: Any, squared: Any, site: Any, spans: Any, apex: Any,
+    lost: Any, ruled: Any, half: Any, obstacle: Any, columns: Any, squared: Any, site: Any, spans: Any, apex: Any,
     height: Any, begins: Any, rows: Any,
 ) -> None:  # fmt: skip
-    """lost: (N, 2) int32 cells with obstacles.  near: (R, B) uint8, zeros, blocks of columns within reach of a loss."""
+    """lost: (N, 2) int32 cells with obstacles.  ruled: (N, 3) int32, work: rows, and what is beside each."""
     total_rows, cols = site.shape
     reach = half.size - 1
-    top, bottom = total_rows, 0
     for k in range(lost.shape[0]):
         row, a = np.int64(lost[k, 0]), np.int64(lost[k, 1])
         above, below = rows_ruled(columns, row, a, total_rows)
-        bits = beside(row, a, obstacle)
-        for r in range(max(above, row - reach), min(below, row + reach) + 1):
-            low, high = span_ruled(r - row, bits, np.int64(half[abs(r - row)]))
-            left: Any = max(a + low, 0)
-            right: Any = min(a + high, cols - 1)
-            if left > right:
-                continue
-            for b in range(left >> _BLOCK_BITS, (right >> _BLOCK_BITS) + 1):
-                near[r, b] = 1
-            top, bottom = min(top, r), max(bottom, r)
+        ruled[k, 0], ruled[k, 1] = max(above, row - reach), min(below, row + reach)
+        ruled[k, 2] = beside(row, a, obstacle)
     for k in range(lost.shape[0]):
         row, a = np.int64(lost[k, 0]), np.int64(lost[k, 1])
         obstacle[row, a] = 0
         columns[a, row >> 6] &= ~(np.uint64(1) << np.uint64(row & 63))
-    for r in range(top, bottom + 1):
-        for b in range(near.shape[1]):
-            if near[r, b] == 0:
+    for k in range(lost.shape[0]):
+        row, a = np.int64(lost[k, 0]), np.int64(lost[k, 1])
+        name = np.int32(row << 16 | a)
+        for r in range(np.int64(ruled[k, 0]), np.int64(ruled[k, 1]) + 1):
+            low, high = span_ruled(r - row, np.int64(ruled[k, 2]), np.int64(half[abs(r - row)]))
+            c: Any = max(a + low, 0)
+            stop: Any = min(a + high + 1, cols)
+            while c < stop and site[r, c] != name:  # what it rules of a row is one run
+                c += 1
+            if c >= stop:
                 continue
-            stop = min((b + 1) << _BLOCK_BITS, cols)
-            c = b << _BLOCK_BITS
-            while c < stop:
-                if not is_orphan(site[r, c], obstacle):
-                    c += 1
-                    continue
-                first = c
-                while first > 0 and is_orphan(site[r, first - 1], obstacle):
-                    first -= 1
-                while c < cols and is_orphan(site[r, c], obstacle):
-                    c += 1
-                refill_run(r, first, c, reach, columns, squared, site, apex, height, begins, rows)
-                note_span(spans, r, first, c)
+            first = c
+            while first > 0 and is_orphan(site[r, first - 1], obstacle):
+                first -= 1
+            while c < cols and is_orphan(site[r, c], obstacle):
+                c += 1
+            refill_run(r, first, c, reach, columns, squared, site, apex, height, begins, rows)
+            note_span(spans, r, first, c)
 
 
 @njit(cache=True, nogil=True)
