@@ -20,6 +20,7 @@ Bools = NDArray[np.bool_]
 _NEIGHBOUR_FACTOR: Final = 1.5
 _WIDEST_WEDGE_RAD: Final = 0.2  # farther apart, beams see nothing between them
 _BATCH: Final = 16
+_LATTICE_M: Final = 1e-6
 
 
 def visibility_polygon(
@@ -121,7 +122,7 @@ class FreeSpace:
 
     def _merge(self) -> None:
         if self._waiting:
-            self._free = shapely.union_all([self._free, *self._waiting])
+            self._free = _union([self._free, *self._waiting])
             self._waiting = []
 
 
@@ -203,6 +204,27 @@ def _valid(polygon: Polygon) -> BaseGeometry:
     return polygon if polygon.is_valid else polygon.buffer(0.0)
 
 
+def _union(parts: Sequence[BaseGeometry]) -> BaseGeometry:
+    """All parts as one.
+
+    Edges that differ by less than rounding, from beams of no length or after a motion, can leave no answer. Corners are
+    then laid on a lattice of a micrometre, and a part that cannot be joined even so is left out, which frees nothing.
+    """
+    with np.errstate(all="ignore"):  # of what GEOS tries on its way
+        try:
+            return shapely.union_all(parts)
+        except shapely.errors.GEOSException:
+            pass
+        joined: BaseGeometry = MultiPolygon()
+        for part in parts:
+            try:
+                laid = shapely.set_precision(part if part.is_valid else part.buffer(0.0), _LATTICE_M)
+                joined = shapely.union(joined, laid, grid_size=_LATTICE_M)
+            except shapely.errors.GEOSException:
+                continue
+    return joined
+
+
 def _smaller(seen: MultiPolygon, by_m: float) -> MultiPolygon:
     """Fewer corners, never more space: what simplifying might add is cut off again."""
     plain = seen.simplify(by_m).buffer(-by_m, join_style="mitre")
@@ -211,7 +233,7 @@ def _smaller(seen: MultiPolygon, by_m: float) -> MultiPolygon:
 
 def _multi(parts: Sequence[BaseGeometry]) -> MultiPolygon:
     """Everything with an area, as one."""
-    joined = shapely.union_all([part for part in parts if not part.is_empty])
+    joined = _union([part for part in parts if not part.is_empty])
     pieces = list(getattr(joined, "geoms", [joined]))
     return MultiPolygon([piece for piece in pieces if isinstance(piece, Polygon) and not piece.is_empty])
 

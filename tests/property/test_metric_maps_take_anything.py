@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 from typing import TypeVar
 
 import numpy as np
@@ -135,12 +136,25 @@ def test_free_space_has_an_area_and_frontiers(drive: list[tuple[list[float], Pos
             )
         )
         area = space.area_m2
-        assert area >= before - 1e-6 * (1.0 + before)
+        assert area >= before - 1e-4 * (1.0 + before)  # a lattice of a micrometre where exact unions fail
         before = area
     for edge in space.frontiers():
         assert edge.ndim == 2
         assert edge.shape[1] == 2
         assert np.isfinite(edge).all()
+
+
+def test_beams_of_hardly_any_length_leave_free_space_whole() -> None:
+    """Unions of such polygons once raised GEOS's TopologyException."""
+    bearing = np.linspace(-2.0, 2.0, 30)
+    for seed, tiny in product(range(40), (1e-300, 1e-3)):
+        random = np.random.default_rng(seed)
+        space = FreeSpace(simplify_m=0.0)
+        for _ in range(3):
+            ranges = random.choice([0.0, 1.0, 1.0, 5.0, 2.0, 30.0, math.inf, tiny], bearing.size)
+            x, y, yaw = (float(v) for v in random.choice([0.0, 1.0, 2.0, 3.0, 0.5], 3))
+            space.insert(Pose2(x, y, yaw), bearing, ranges, range_max_m=30.0)
+        assert 0.0 <= space.area_m2 < 3.0 * math.pi * 30.0**2
 
 
 # ------------------------------------------------------------------------------------------------------------- planes
