@@ -47,6 +47,7 @@ FITTED_ON = ("fr079-2", "intel-2", "wean1")
 ALL = ("fr079-1", "fr079-2", "intel-1", "intel-2", "wean1", "wean3")
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(10.0)
 WEAN_START = Pose2(44.75, 15.65, -1.54)
+FEW = 10
 WRONG_COUNTS = 2.0  # a right place that is doubted costs a moment, a wrong one that is believed more
 BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.001)
 
@@ -331,7 +332,7 @@ def fitted(samples: list[Sample]) -> Coefficients:
 
 
 def draw(rows: dict[str, list[tuple[float, float, int]]], path: Path) -> None:
-    """The reliability diagram."""
+    """The reliability diagram, without bins of fewer than FEW samples."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -339,7 +340,8 @@ def draw(rows: dict[str, list[tuple[float, float, int]]], path: Path) -> None:
 
     figure, axes = plt.subplots(figsize=(5.2, 4.6), dpi=110)
     axes.plot([0, 1], [0, 1], color="0.6", lw=1)
-    for name, each in rows.items():
+    for name, every in rows.items():
+        each = [row for row in every if row[2] >= FEW]
         style = "--" if name in FITTED_ON else "-"
         axes.plot([r[0] for r in each], [r[1] for r in each], f"o{style}", ms=4, lw=1.2, label=name)
     axes.set(xlabel="probability told", ylabel="share that was right", xlim=(0, 1.01), ylim=(0, 1.01))
