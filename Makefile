@@ -52,6 +52,7 @@ fuzz: venv  ## Damaged bytes and random scenes, far more than `make test` tries
 
 soak: venv  ## Everything with real wires again and again, SOAK times, stopping at the first failure
 	for round in $$(seq $(SOAK)); do echo "round $$round"; $(PYTEST) -q -x tests/loop tests/crash $(ARGS) || exit 1; done
+	UMFELD_LAPS=200 $(PYTEST) -q -x tests/world/test_room_ids_laps.py --timeout 3600 $(ARGS)
 
 interop: venv  ## Against other people's programs, where they are installed
 	@if [ -d tests/interop ]; then $(PYTEST) tests/interop $(ARGS); else echo "no tests/interop in this tree"; fi

@@ -183,8 +183,9 @@ class PlaceMaker:
 
     def _node(self, area: Area) -> dict[str, Any]:
         walls = area.walls.lines(min_seen=2)
-        ends = np.concatenate((walls.start_m, walls.end_m)) if len(walls) else np.zeros((1, 2))
-        middle = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
+        middle = np.zeros(2)
+        if len(walls):  # by length, so that what was seen through an opening moves it little
+            middle = np.average(0.5 * (walls.start_m + walls.end_m), axis=0, weights=walls.length_m)
         frame = self.frames.get(area.number, IDENTITY)
         x, y = frame.apply(middle[None, :])[0].tolist()
         is_place = area.kind.value == "place"
