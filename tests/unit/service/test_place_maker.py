@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from mapping.frames import Pose2
 from mapping.scan import Scan
 from service import assemble
-from service.config import Config
+from service.config import Config, check
+from service.config_files import read_layers
+from service.errors import WrongUsage
 from service.map_makers import MapMakers, MapView
 from service.outputs import DocumentOut
 from service.place_maker import PlaceMaker
@@ -60,3 +64,13 @@ def test_a_jump_is_no_motion_and_a_correction_is_doubted() -> None:
     assert maker.counts["places.lost"] == 1
     assert len(maker.hybrid.areas) == 1  # it was not driven anywhere
     assert makers.counters()["places.lost"] == 1
+
+
+@pytest.mark.parametrize(
+    "other", ["[topo]\nenabled = true\n", "[rings.body]\ndriver = 'alice'\nport = '/dev/ttyUSB1'\n"]
+)
+def test_map_topo_is_one_map(other: str, tmp_path: Path) -> None:
+    path = tmp_path / "umfeld.toml"
+    path.write_text("[places]\nenabled = true\n" + other)
+    with pytest.raises(WrongUsage, match="map/topo is one map"):
+        check(read_layers(path))
