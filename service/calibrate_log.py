@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs import Log, PoseKind, read_log
+from drivers.logs import Log, LogError, PoseKind
 from mapping.localise.calibrate import NAMES, Calibration, RobotModel, WheelTicks, calibrate
 from mapping.localise.pose_graph import composed_poses
 from mapping.localise.relative_motions import RelativeMotions, relative_motions, spread_out, way_between
 from mapping.localise.umbmark import SIDE_M, square_end
 from service.errors import WrongUsage
+from service.recording_log import read_any_log
 from service.slam_log import run_slam, scan_of
 
 F64 = NDArray[np.float64]
@@ -47,7 +48,10 @@ def calibrate_log(
 
     track_width_m: believed, for logs without ticks. WrongUsage if the log has corrected poses or none that move.
     """
-    log = read_log(path)
+    try:
+        log = read_any_log(path)
+    except LogError as error:
+        raise WrongUsage(str(error)) from error
     if log.poses is not PoseKind.ODOMETRY or len(log.odometry) < 2:
         raise WrongUsage(f"{path}: holds no odometry, so it says nothing about wheels")
     wheels = log.wheels

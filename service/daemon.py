@@ -87,8 +87,11 @@ class Daemon:
 
     # --- the life of the process
 
-    def run(self) -> int:
-        """Start, wait for SIGINT or SIGTERM, stop; returns the exit code. Trouble if it cannot start."""
+    def run(self, *, seconds: float = 0.0) -> int:
+        """Start, wait for SIGINT or SIGTERM, stop; returns the exit code. Trouble if it cannot start.
+
+        seconds: end by itself so long after it was ready; 0: when told.
+        """
         faulthandler.enable(file=sys.__stderr__ or sys.stderr)
         with _StopSignals() as asked:
             self._stop_asked = asked
@@ -102,7 +105,8 @@ class Daemon:
             try:
                 self._notifier.ready(self._summary())
                 log.info("%s", self._summary())
-                while not asked.wait(1.0):
+                end_ns = self._clock.now_ns() + round(seconds * 1e9)
+                while not asked.wait(1.0) and not (seconds and self._clock.now_ns() >= end_ns):
                     self._notifier.status(self._summary())
             finally:
                 log.info("stopping: closing ports, saving the map")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs import LogError, read_log
+from drivers.logs import LogError
 from mapping.features.anchors import AnchorFinder, AnchorKind, Anchors
 from mapping.features.graph import anchor_graph
 from mapping.features.histograms import SquareScene, box_feature, square_scene, virtual_edges
@@ -20,6 +20,7 @@ from mapping.features.moments import arc_weights, inertia, smoothed_inertia
 from mapping.features.range_image import segment_ranges
 from mapping.features.scenes import SCENE_FEATURES, scene_vector
 from service.errors import WrongUsage
+from service.recording_log import read_any_log
 
 F64 = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ class ScanFeatures:
 def features_of_log(path: Path, *, scan: int = 0) -> ScanFeatures:
     """Features S14 to S24 of one scan (from 0; negative from the end).  WrongUsage if the log has no such scan."""
     try:
-        log = read_log(path)
+        log = read_any_log(path)
     except (LogError, OSError) as error:
         raise WrongUsage(str(error)) from error
     count = len(log.scans)

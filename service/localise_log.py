@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.logs import Log, LogError, LogScan, read_log
+from drivers.logs import Log, LogError, LogScan
 from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
 from mapping.localise.in_map import InMapSettings, Located, MapLocaliser, SearchResult, State
@@ -22,6 +22,7 @@ from service.errors import WrongUsage
 from service.export import pixels_of
 from service.files import Receipt, write_whole
 from service.map_localiser import fields_of, read_map
+from service.recording_log import read_any_log
 
 Progress = Callable[[int, int], None]
 
@@ -66,7 +67,7 @@ def localise_log(
     Raises WrongUsage if the log is none or holds no scan, MapFileTrouble if the map cannot be read.
     """
     try:
-        log = read_log(log_path)
+        log = read_any_log(log_path)
     except (LogError, OSError) as error:
         raise WrongUsage(str(error)) from error
     scans = log.scans[::every]

@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.logs import Log, LogError, LogScan, read_log
+from drivers.logs import Log, LogError, LogScan
 from mapping.frames import Pose2
-from mapping.lines.extract import LineExtractor, LineRules
+from mapping.lines.extract import LineExtractor, LineRules, are_in_order
 from mapping.lines.line_map import LineMap
 from mapping.lines.lines import Lines
 from service.errors import WrongUsage
+from service.recording_log import read_any_log
 
 Progress = Callable[[int, int], None]
 
@@ -47,7 +48,7 @@ def lines_of_log(
     support; a single scan keeps all.  Raises WrongUsage if the log cannot be read or has no such scan.
     """
     try:
-        log = read_log(path)
+        log = read_any_log(path)
     except (LogError, OSError) as error:
         raise WrongUsage(str(error)) from error
     if scan is not None:
@@ -67,6 +68,8 @@ def line_map_of(
     extractors: dict[int, LineExtractor] = {}
     line_map, found = LineMap(), 0
     for index, (each, pose) in enumerate(zip(scans, map_from_laser, strict=True)):
+        if not are_in_order(each.bearing_rad):
+            continue  # of a head that trembles
         key = id(each.bearing_rad)  # shared between the scans of a device
         if key not in extractors:
             extractors[key] = LineExtractor(each.bearing_rad, rules, range_max_m=range_max_m)

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs import Log, LogError, LogScan, PoseKind, read_log
+from drivers.logs import Log, LogError, LogScan, PoseKind
 from mapping.frames import Pose2, wrap_angle
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
@@ -37,6 +37,7 @@ from service.line_files import write_lines
 from service.log_lines import line_map_of
 from service.map_export import LINES, lines_layer
 from service.map_import import write_grid_map
+from service.recording_log import read_any_log
 
 F64 = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -98,7 +99,7 @@ def build(
     """
     started = time.monotonic()
     try:
-        log = read_log(path)
+        log = read_any_log(path)
     except (LogError, OSError) as error:
         raise WrongUsage(str(error)) from error
     scans = log.scans[::every]

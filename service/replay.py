@@ -14,8 +14,8 @@ import math
 import struct
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from service.clock import CrankedClock
 from service.config import Config, check
 from service.config_files import Layers
 from service.errors import Trouble
-from service.fusion import TICK_PERIOD_NS, Fusion, StoredTile
+from service.fusion import TICK_PERIOD_NS, Fusion, GridLayer, StoredTile
 from service.outputs import Output, PoseOut
 from service.recording import (
     END,
@@ -275,7 +275,8 @@ class Replay:
     offer and pace may be set before it runs: offer takes every output as it comes, for pace see Pace.
     """
 
-    def __init__(self, recording: Recording, *, config: Config | None = None) -> None:
+    def __init__(self, recording: Recording, *, config: Config | None = None, layers: Sequence[GridLayer] = ()) -> None:
+        """layers: more that takes posed sweeps, as grids do."""
         self.recording = recording
         self.head = recording.head()
         self.config = config_of(self.head) if config is None else config
@@ -294,7 +295,8 @@ class Replay:
         self._load_map()
         start = self.head.start
         localiser = assemble.localiser(self.config, found, maps, Pose2(*start.pose), at_once, stored=start.slam)
-        self.fusion = Fusion(assemble.parts(self.config, found, maps, localiser))
+        parts = assemble.parts(self.config, found, maps, localiser)
+        self.fusion = Fusion(replace(parts, grids=(*parts.grids, *layers)))
         self._waiting: dict[str, deque[Reading | DeviceEvent]] = {}
         self._next_tick_ns = self.head.begun_ns
         self._unknown_wires: set[str] = set()

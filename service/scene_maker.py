@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapping.features.scenes import Answer, Candidate, SceneDatabase, sight_of
 from mapping.frames import Pose2, wrap_angle
 from mapping.lines.extract import are_in_order
-from mapping.scan import Scan
+from mapping.scan import Scan, seen_from
 from service.map_makers import MapView, Tile
 from service.outputs import DocumentOut, Output
 from service.rpc import CallRefused
@@ -188,29 +188,18 @@ def _pose_fields(pose: Pose2) -> dict[str, float]:
 
 
 def _as_seen_from(middle: Pose2, scan: Scan, poses: F64) -> Scan | None:
-    """A sweep taken while moving, as it would have been seen from one pose; None if its beams cross there.
-
-    Beams without a range keep their status, and turn as the sensor did.
-    """
+    """A sweep taken while moving, as it would have been seen from one pose; None if its beams cross there."""
     if len(poses) != len(scan.bearing_rad):
         return None
     if np.abs(poses[-1] - poses[0]).max(initial=0.0) < 1e-6 and np.ptp(poses, axis=0).max() < 1e-6:
         return scan
-    hit = np.isfinite(scan.range_m)
-    bearing = scan.bearing_rad + (poses[:, 2] - middle.yaw_rad)
-    distance = scan.range_m.copy()
-    angle = scan.bearing_rad[hit] + poses[hit, 2]
-    reach = scan.range_m[hit][:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-    points = middle.inverse().apply(poses[hit, :2] + reach)
-    seen = np.arctan2(points[:, 1], points[:, 0])
-    bearing[hit] += (seen - bearing[hit] + math.pi) % (2.0 * math.pi) - math.pi
-    distance[hit] = np.hypot(points[:, 0], points[:, 1])
+    bearing, distance = seen_from(middle, scan, poses)
     # A beam without a range may end up beside its neighbours' order; where it does, it tells nothing.
     order = np.sign(scan.bearing_rad[-1] - scan.bearing_rad[0])
     if len(bearing) < 3:
         return None
     onward = np.diff(bearing) * order > 0.0
-    kept = hit.copy()
+    kept = np.isfinite(scan.range_m)
     kept[1:-1] |= onward[:-1] & onward[1:]
     kept[0] |= onward[0]
     kept[-1] |= onward[-1]

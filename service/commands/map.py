@@ -234,7 +234,7 @@ def import_map(
     out: Annotated[Path, typer.Argument(help="The map file to make, NAME.umfeld.")],
     *,
     resolution: Annotated[float | None, typer.Option(help="Cells of this many metres; default: the picture's.")] = None,
-    model: Annotated[Model, typer.Option(help="As in [grid] of the daemon that shall load it.")] = Model.COUNTERS,
+    model: Annotated[Model, typer.Option(help="As grid.model of the daemon that shall load it.")] = Model.COUNTERS,
     anchor: Annotated[
         str | None, typer.Option(help="LAT,LON[,YAW] of the map's origin on the earth, in degrees; kept in the file.")
     ] = None,

@@ -21,7 +21,7 @@ app = typer.Typer()
 @app.command()
 def record(
     *,
-    out: Annotated[Path | None, typer.Option(help="Folder for the recording; default: that of [recording].")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the recording; default: the configured one.")] = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="End after so long; 0: when interrupted.")] = 0.0,
     raw_only: Annotated[bool, typer.Option("--raw-only", help="Only what replay needs, nothing published.")] = False,
     detach: Annotated[bool, typer.Option("--detach", help="Start recording in the daemon and return.")] = False,
@@ -116,23 +116,15 @@ def _fetched(files: list[str], out: Path) -> list[str]:
 
 def _run_recording(config: Path | None, settings: list[str], out: Path | None, seconds: float, raw_only: bool) -> None:
     """Be the daemon, with a recording from its first byte."""
-    import os
-    import signal
-    import threading
-
-    from service.commands.run import run
+    from service.commands.run import serve
 
     wanted = [*settings, "recording.enabled=true"]
     if out is not None:
         wanted.append(f"recording.folder={json.dumps(str(out.absolute()))}")
     if raw_only:
         wanted.append("recording.published=false")
-    if seconds:
-        timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGTERM))
-        timer.daemon = True
-        timer.start()
     typer.echo("no daemon is running: this is one now, and it records; Ctrl-C ends both", err=True)
-    run(config=config, settings=wanted)
+    serve(config, wanted, seconds=seconds)
 
 
 def _report(answer: Mapping[str, Any], as_json: bool) -> None:

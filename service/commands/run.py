@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -27,15 +28,20 @@ def run(
 
     Example: umfeld run --config /etc/umfeld/umfeld.toml
     """
+    serve(config, settings or ())
+
+
+def serve(config: Path | None, settings: Sequence[str], *, seconds: float = 0.0) -> None:
+    """Be the daemon until told to stop, or for so many seconds once it is ready; ends the process."""
     from service.config import load
 
-    loaded = load(config, settings=settings or ())  # first, so that a fault in it is told before anything heavy loads
+    loaded = load(config, settings=settings)  # first, so that a fault in it is told before anything heavy loads
     logging.basicConfig(
         level=loaded.config.log.level.upper(), format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", force=True
     )
     from service.daemon import Daemon
 
-    code = Daemon(loaded).run()
+    code = Daemon(loaded).run(seconds=seconds)
     logging.shutdown()
     sys.stdout.flush()
     os._exit(code)  # all is closed; taking the interpreter and the compiled kernels apart would cost a second or two

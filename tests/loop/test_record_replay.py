@@ -12,8 +12,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from service.export import MapImage, load_pgm_yaml
+from service.recording_log import read_any_log
 from service.replay import Recording, Replay
 from service.zenoh_session import Client
 
@@ -107,6 +111,12 @@ def occupied(client: Client) -> int:
     return int(client.call("robots/artos", "map_info")["occupied_cells"])
 
 
+def occupied_points(image: MapImage) -> NDArray[np.float64]:
+    """(N, 2) middles of occupied cells, map frame."""
+    rows, columns = np.nonzero(image.cells >= 65)
+    return np.asarray(image.origin.apply((np.stack((columns, rows), axis=-1) + 0.5) * image.resolution_m))
+
+
 def test_a_recording_from_the_first_byte_gives_the_map_that_was_made_live(robot: Robot) -> None:
     daemon = robot.start("service", "record", "--config", str(robot.config))
     with robot.client() as client:
@@ -138,6 +148,20 @@ def test_a_recording_from_the_first_byte_gives_the_map_that_was_made_live(robot:
     about = json.loads(robot.command("map", "info", f"{robot.folder}/out/map.umfeld", "--json"))
     assert about["check"] == "ok"
     assert about["grid"]["occupied_cells"] > 200
+
+    # As a log, mapped offline: walls where they were live.
+    built = json.loads(robot.command("map", "build", str(path), "--out", f"{robot.folder}/built", "--json"))
+    assert built["slam"]["odometry"]
+    assert built["lines"] > 3
+    live, offline = (load_pgm_yaml(robot.folder / folder / "map.yaml") for folder in ("out", "built"))
+    walls, found = occupied_points(live), occupied_points(offline)
+    off_m = np.hypot(*(found[:, None, :] - walls[None, :, :]).transpose(2, 0, 1)).min(axis=1)
+    assert np.mean(off_m < 0.08) > 0.9
+    assert (
+        len(read_any_log(path).scans)
+        == built["scans"]
+        == len((robot.folder / "built/trajectory.tum").open().readlines())
+    )
 
     # Cut anywhere, and with other settings, it is still a map, the same every time, and it says what it is not.
     data = path.read_bytes()
