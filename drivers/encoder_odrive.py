@@ -32,7 +32,7 @@ _SEARCH_PERIOD_NS = 100 * _MS
 _OVERDUE_NS = 1_000 * _MS
 _LOST_NS = 500 * _MS  # five heartbeats
 _COUNT_PATIENCE_NS = 300 * _MS  # both live, but one does not answer 0Ah for so long: it does not know it
-_SENT_BY_ITSELF_NS = 50 * _MS  # position came unasked within this: it is not asked for
+_SENT_BY_ITSELF_NS = 250 * _MS  # a position that comes unasked within this is not asked for
 _COARSE_TURNS = 8192.0
 _MOST_TURNS = float(1 << 23)  # beyond, a float has no fraction of a turn left
 _NEVER_HEARD = -(1 << 62)
@@ -211,6 +211,7 @@ class ODrivePairConversation:
 
     def _read(self, *, by_count: bool) -> None:
         self._by_count = by_count
+        self._listens_since_ns = self._now_ns
         self._meeting.restart()
         self._counts.restart()
 
@@ -225,7 +226,7 @@ class ODrivePairConversation:
         if self._by_count:
             return [_ask(axis.node, Command.COUNT) for axis in self._axes]
         limit_ns = max(_SENT_BY_ITSELF_NS, 2 * self._period_ns)
-        mute = [axis for axis in self._axes if now_ns - axis.unasked_ns > limit_ns]
+        mute = [axis for axis in self._axes if now_ns - max(axis.unasked_ns, self._listens_since_ns) > limit_ns]
         for axis in mute:
             axis.asked = True
         return [_ask(axis.node, Command.ESTIMATES) for axis in mute]

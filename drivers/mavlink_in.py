@@ -54,7 +54,10 @@ _COMPONENT = 196  # MAV_COMP_ID_OBSTACLE_AVOIDANCE
 _TYPE_ONBOARD, _TYPE_GCS, _AUTOPILOT_INVALID, _STATE_ACTIVE, _VERSION = 18, 6, 8, 4, 3
 _SET_MESSAGE_INTERVAL = 511
 _LOCAL_NED, _LOCAL_ENU, _BODY_NED, _BODY_FRD, _BODY_FLU, _LOCAL_FRD, _LOCAL_FLU = 1, 4, 8, 12, 13, 20, 21
-_DOWN_FRAMES = {(frame, child) for frame in (_LOCAL_NED, _LOCAL_FRD) for child in (_BODY_FRD, _BODY_NED)}
+_VISION_NED, _ESTIM_NED = 16, 18  # of older autopilots and of MAVSDK; reserved today
+_DOWN_FRAMES = {
+    (frame, child) for frame in (_LOCAL_NED, _LOCAL_FRD, _VISION_NED, _ESTIM_NED) for child in (_BODY_FRD, _BODY_NED)
+}
 _UP_FRAMES = {(frame, _BODY_FLU) for frame in (_LOCAL_FLU, _LOCAL_ENU)}
 _QUALITY_INVALID = 1  # of DISTANCE_SENSOR: 0 not told, 1 no valid signal, 100 perfect
 _AUTOPILOTS = {3: "ArduPilot", 12: "PX4"}

@@ -35,8 +35,9 @@ _FIRST_BACKOFF_NS = 100_000_000
 _LONGEST_BACKOFF_NS = 1_000_000_000
 _SILENCE_PATIENCE_NS = 400_000_000  # a device that only paused keeps its set-up, and wheels their count
 _SHORTEST_BEFORE_RESET_NS = 600_000_000
+_SILENCE_OF_STRANGERS_NS = 200_000_000  # until a source's usual period is known
 _MUCH_LONGER = 1.5  # less is the jitter of its deliveries
-_INTERVALS_KEPT = 9  # the middle one of so many is a source's usual period
+_INTERVALS_KEPT = 9  # three quarters of so many are no longer than a source's usual period
 _CHECK_PERIOD_NS = 10_000_000  # silence and words are looked at so often; a change of state at once
 _OWN_PAUSE_NS = 30_000_000  # so much later than it should be, the loop itself was held up
 _SETUP_LIMIT_NS = 20_000_000_000  # spin-up and the search for a line speed included
@@ -453,6 +454,8 @@ class _Source(Generic[WireT]):
     def _silence_limit_ns(self) -> int:
         """What the conversation says, or three of the periods that were measured where the device takes much longer."""
         told_ns = self._conversation.silence_limit_ns
+        if self._usual.period_ns == 0:
+            return max(told_ns, _SILENCE_OF_STRANGERS_NS)
         found_ns = min(3 * self._usual.period_ns, MOST_SILENCE_NS)
         return found_ns if found_ns > _MUCH_LONGER * told_ns else told_ns
 
@@ -600,7 +603,10 @@ class _Rate:
 
 
 class _UsualPeriod:
-    """The middle one of the newest intervals between readings; 0 until there are enough. One pause does not move it."""
+    """The third quartile of the newest intervals between readings; 0 until there are enough.
+
+    One pause does not move it, and of readings that come in pairs it is the wait for the next pair.
+    """
 
     def __init__(self) -> None:
         self.period_ns = 0
@@ -611,7 +617,7 @@ class _UsualPeriod:
         if self._last_ns is not None:
             self._intervals.append(stamp_ns - self._last_ns)
             if len(self._intervals) == _INTERVALS_KEPT:
-                self.period_ns = sorted(self._intervals)[_INTERVALS_KEPT // 2]
+                self.period_ns = sorted(self._intervals)[_INTERVALS_KEPT * 3 // 4]
         self._last_ns = stamp_ns
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import importlib.util
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +16,10 @@ import numpy as np
 import pytest
 import serial
 
+from drivers.encoder_odrive import ODrivePairConversation
+from drivers.ports import CanPort
+from drivers.reader import WireReader
+from drivers.readings import DeviceEvent, Reading, WheelReading
 from sim_devices.attach import Attachment, PtyLink
 from sim_devices.device import F64, Mount
 from sim_devices.encoder_arduino_bridge import ArduinoBridge, Sonar
@@ -139,6 +144,40 @@ def test_odrive_can_reads_and_drives(tmp_path: Path, generation: str) -> None:
 
     with loop:
         asyncio.run(drive())
+
+
+@needs("odrive_can")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_our_driver_reads_odrive_cans_mock() -> None:
+    """Another project's emulator: 5 heartbeats and 10 positions a second, and zeros for whoever asks for a position."""
+    make: Callable[..., Any] = importlib.import_module("odrive_can.mock").ODriveCANMock
+    channel = "mock of odrive_can"
+    for axis in (0, 1):
+        mock = make(axis, can.Bus(interface="virtual", channel=channel))
+        mock.odrive.control_mode, mock.odrive.axis_state = "VELOCITY_CONTROL", "CLOSED_LOOP_CONTROL"
+        mock.odrive.model.setpoint = 1.0
+        threading.Thread(target=mock.start, daemon=True).start()
+    heard: list[WheelReading] = []
+
+    def sink(_: str, item: Reading | DeviceEvent) -> None:
+        if isinstance(item, WheelReading):
+            heard.append(item)
+
+    pair = ODrivePairConversation(0, 1)
+    reader = WireReader(
+        "can",
+        lambda: CanPort(interface="virtual", channel=channel, clock=time.monotonic_ns),
+        {"drive": pair},
+        sink,
+        clock=time.monotonic_ns,
+    )
+    reader.start()
+    time.sleep(4.0)
+    reader.stop()
+    assert pair.counters.drops == {}
+    assert all(reading.continuous for reading in heard[1:])
+    rolled = heard[-1].left_ticks - heard[0].left_ticks
+    assert rolled == pytest.approx(8192 * (heard[-1].stamp_ns - heard[0].stamp_ns) * 1e-9, rel=0.1)
 
 
 def _described(objects: dict[int, tuple[str, int]]) -> Any:

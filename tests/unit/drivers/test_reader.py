@@ -298,6 +298,19 @@ def test_a_device_slower_than_it_was_told_to_be_gets_three_of_its_own_periods() 
     assert told_ms - 5_010 <= 3 * 80 + 20
 
 
+def test_readings_in_pairs_are_no_silence_between_them() -> None:
+    """Two nodes that send at their own times, ten times a second, where a hundred were configured."""
+    bench = Bench()
+    bench.talker.silence_limit_ns = silence_limit(10 * MS)
+    bench.say_from_to(50, 5_000, 100)
+    bench.say_from_to(54, 5_000, 100)
+    bench.plan.sort(key=lambda each: each[0])
+    bench.run_until(1_500)
+    settled = len(bench.states())
+    bench.run_until(5_000)
+    assert len(bench.states()) == settled
+
+
 def test_our_own_pause_is_no_silence_of_the_device() -> None:
     """This thread did not run for 2 s, so it did not ask: the device could not answer."""
     bench = Bench()
