@@ -33,7 +33,15 @@ from mapping.localise.pose_graph import (
     optimise,
     weights_of,
 )
-from mapping.localise.scan_match import TRACKING, Match, Reach, agreement, match_view, weakest_information
+from mapping.localise.scan_match import (
+    TRACKING,
+    Agreement,
+    Match,
+    Reach,
+    agreement,
+    match_view,
+    weakest_information,
+)
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.views import ViewArrays
 
@@ -51,9 +59,11 @@ class ClosureSettings:
     the sum of both, at most search_m.  tracked_m: up to this drift no search is needed.  turn_rad_per_m: heading drift.
     place_m: key scans on either side along the way that make up a place.  every_m: a place is searched for so
     often, at most `searches` times in one piece of work.  score, rival: of a search, see Found.
-    explained, overlap, mean_cost: of the points, see Agreement and Match; half_*: what still has half a vote (leaves,
-    lawns and crowds fit nowhere well).  weakest_per_m2: least information in the worst direction.
-    agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way.
+    explained, overlap, mean_cost: of the points, see Agreement and Match; half_*: what still has half a vote.
+    weakest_per_m2: least information in the worst direction.  rough_*: what still has rough_worth of a vote: outdoors
+    nothing is a plane and little holds a pose, but nearly all that was seen is seen again.
+    agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way,
+    groups of rough ones over rough_way_m.
     pending: how many closures wait at most.  undone_below: the weight under which a closure is forgotten in the end.
     floor_*: errors of a match that no matcher sees.  misfit: median squared distance of new closures from the map that
     makes an optimisation due; so do optimise_every new ones.
@@ -80,8 +90,14 @@ class ClosureSettings:
     half_overlap: float = 0.88
     half_mean_cost: float = 0.42
     weakest_per_m2: float = 1000.0
+    rough_explained: float = 0.70
+    rough_overlap: float = 0.95
+    rough_mean_cost: float = 0.60
+    rough_weakest_per_m2: float = 250.0
+    rough_worth: float = 0.34
     agreeing: int = 3
     agreeing_way_m: float = 1.2
+    rough_way_m: float = 6.0
     pending: int = 64
     floor_m: float = 0.015
     floor_rad: float = math.radians(0.15)
@@ -353,22 +369,27 @@ class Work:
             self._events["ran_away"] += 1
             return None
         agrees = agreement(shot.views.view(key), shot.views, rows, shot.poses[rows], match.pose)
-        fits = agrees.explained >= s.explained and agrees.overlap >= s.overlap and match.mean_cost <= s.mean_cost
-        if not fits and not (
-            searched
-            and agrees.explained >= s.half_explained
-            and agrees.overlap >= s.half_overlap
-            and match.mean_cost <= s.half_mean_cost
-        ):
-            self._events["does_not_fit"] += 1
-            return None
         information = match.information()
-        if weakest_information(information) < s.weakest_per_m2:
-            self._events["degenerate"] += 1
+        weakest = weakest_information(information)
+        worth = self._worth(agrees, match.mean_cost, weakest)
+        if worth <= 0.0 or (worth < 1.0 and not searched):
+            self._events["degenerate" if weakest < s.weakest_per_m2 else "does_not_fit"] += 1
             return None
         start = Pose2(*shot.poses[place].tolist())
         seen = floored(turned_information(information, -start.yaw_rad), s.floor_m, s.floor_rad)
-        return Closure(place, key, start.inverse() @ match.pose, seen, 1.0 if fits else 0.5, searched)
+        return Closure(place, key, start.inverse() @ match.pose, seen, worth, searched)
+
+    def _worth(self, agrees: Agreement, mean_cost: float, weakest_per_m2: float) -> float:
+        """The vote of a single closure; 0 if it does not pass."""
+        s = self.settings
+        explained, overlap = agrees.explained, agrees.overlap
+        if weakest_per_m2 >= s.weakest_per_m2:
+            if explained >= s.explained and overlap >= s.overlap and mean_cost <= s.mean_cost:
+                return 1.0
+            if explained >= s.half_explained and overlap >= s.half_overlap and mean_cost <= s.half_mean_cost:
+                return 0.5
+        is_rough = explained >= s.rough_explained and overlap >= s.rough_overlap and mean_cost <= s.rough_mean_cost
+        return s.rough_worth if is_rough and weakest_per_m2 >= s.rough_weakest_per_m2 else 0.0
 
     # --- probation
 
@@ -385,7 +406,8 @@ class Work:
         if votes < s.agreeing:
             return [], pending
         way = [float(travel[pending[k].to]) for k in best]
-        if max(way) - min(way) < s.agreeing_way_m:
+        is_rough = sum(pending[k].worth >= 0.5 for k in best) < 2
+        if max(way) - min(way) < (s.rough_way_m if is_rough else s.agreeing_way_m):
             return [], pending
         chosen = set(best)
         return [pending[k] for k in best], [c for k, c in enumerate(pending) if k not in chosen]

@@ -1,0 +1,47 @@
+"""SLAM round a block of long corridors whose doors repeat, with wheels that lie as badly as any recorded log's."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.slam_large import HALLS, Case, drive, false_closures, pair_errors, pairs, simulated
+from mapping.frames import Pose2
+from mapping.scan import Scan
+
+BLOCK = replace(HALLS, columns_m=(0.0, 62.0), rows_m=(0.0, 44.0), tour=((0, 0), (1, 0), (1, 1), (0, 1), (0, 0), (1, 0)))
+
+EMPTY = Scan(0, 0.0, np.zeros(0), np.zeros(0), 0.05, 30.0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_loop_of_two_hundred_metres_is_closed_and_nothing_else() -> None:
+    case = simulated("block", BLOCK, 5)
+    assert np.hypot(*(case.odometry[:, :2] - case.truth[:, :2]).T).max() > 10.0  # or the test would prove nothing
+    slam = drive(case)
+    off_m, off_deg = pair_errors(case, slam.trajectory()[1], pairs(case))
+    assert off_m.max() < 0.15
+    assert off_deg.max() < 1.5
+    assert sum(closure.searched for closure in slam.closures) >= 3
+    assert not false_closures(case, slam)
+
+
+def test_pairs_are_visits_of_one_place_and_their_errors_are_relations() -> None:
+    x = np.concatenate((np.linspace(0.0, 40.0, 100), np.linspace(40.0, 0.0, 100), np.linspace(0.0, 40.0, 100)))
+    yaw = np.repeat([0.0, math.pi, 0.0], 100)
+    truth = np.stack((x, np.zeros(300), yaw), axis=-1)
+    scans = tuple(replace(EMPTY, stamp_ns=k * 10**9) for k in range(300))
+    case = Case("straight", scans, truth, truth, Pose2())
+    chosen = pairs(case)
+    assert np.all((chosen[:, 0] < 100) & (chosen[:, 1] >= 200))  # facing the other way is no second visit
+    assert np.max(np.abs(truth[chosen[:, 0], 0] - truth[chosen[:, 1], 0])) <= 2.0
+    moved = truth.copy()
+    moved[200:, 1] += 0.3
+    moved[200:, 2] += 0.1
+    off_m, off_deg = pair_errors(case, moved, chosen)
+    np.testing.assert_allclose(off_m, 0.3, atol=1e-9)
+    np.testing.assert_allclose(off_deg, math.degrees(0.1), atol=1e-9)
