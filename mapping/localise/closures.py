@@ -231,9 +231,9 @@ class Work:
             near, wide = self._places(key, way_m[row])
             for place in near:
                 tracked += self._track(key, place)
-            # Where the search is wide, it is made more rarely: its cost grows with the square.
-            every_m = max(self.settings.every_m, *(0.05 * self._drift(way_m[row][place]) for place in wide), 0.0)
-            may_search = self._events["searches"] < self.settings.searches
+            # Where the search is wide, it is made more rarely: it costs more.
+            every_m = max(self.settings.every_m, *(0.03 * self._drift(way_m[row][place]) for place in wide), 0.0)
+            may_search = self._events["searches"] < max(self.settings.searches, len(self.snapshot.keys) // 3)
             if wide and may_search and self.snapshot.travel_m[key] - last_search_m >= every_m:
                 last_search_m = float(self.snapshot.travel_m[key])
                 searched += self._search(key, wide, way_m[row])
