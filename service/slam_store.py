@@ -146,16 +146,19 @@ def _stored_of(rows: Mapping[int, Sequence[bytes]]) -> Stored:
 
 
 def _key_tile(state: SlamState, number: int) -> bytes:
-    rows = slice(number * KEYS_A_TILE, min(state.views.count, (number + 1) * KEYS_A_TILE))
-    v = state.views
-    path = np.concatenate((np.zeros((1, 3)), state.path))[rows]
-    information = np.concatenate((np.zeros((1, 3, 3)), state.information))[rows]
+    """What was given up of the views stands there as nothing: no bins."""
+    first, last = number * KEYS_A_TILE, min(state.views.count, (number + 1) * KEYS_A_TILE)
+    v, keys = state.views, slice(first, last)
+    there = v.is_there()[keys]
+    rows = v.rows(np.arange(first, last))
+    path = np.concatenate((np.zeros((1, 3)), state.path))[keys]
+    information = np.concatenate((np.zeros((1, 3, 3)), state.information))[keys]
     return _pack(
-        stamps=state.stamps[rows],
-        mounts=state.base_from_sensor[rows],
-        frames=v.frames[rows],
-        points=np.rint(np.stack((v.x[rows], v.y[rows])) / _POINT_M).astype(np.int32),
-        normals=np.rint(np.stack((v.nx[rows], v.ny[rows])) * 32767.0).astype(np.int16),
+        stamps=state.stamps[keys],
+        mounts=state.base_from_sensor[keys],
+        frames=np.where(there[:, None], v.frames[rows], 0.0),
+        points=np.rint(np.stack((v.x[rows], v.y[rows])) / _POINT_M * there[:, None]).astype(np.int32),
+        normals=np.rint(np.stack((v.nx[rows], v.ny[rows])) * 32767.0 * there[:, None]).astype(np.int16),
         quality=v.quality[rows].astype(np.float16),
         path=path,
         information=information,

@@ -264,7 +264,8 @@ class Work:
     def _places(self, key: int, way_m: F64) -> tuple[list[int], list[int]]:
         """Keys at the middle of places to compare with: those near enough to track, and those to search."""
         shot, s = self.snapshot, self.settings
-        earlier = np.flatnonzero(shot.travel_m[key] - shot.travel_m[: key + 1] > s.apart_m)
+        there = shot.views.is_there()[: key + 1]
+        earlier = np.flatnonzero((shot.travel_m[key] - shot.travel_m[: key + 1] > s.apart_m) & there)
         if not len(earlier):
             return [], []
         off = shot.poses[earlier] - shot.poses[key]
@@ -304,7 +305,7 @@ class Work:
     def _around(self, place: int, key: int, reach_m: float, most: int) -> I64:
         """Keys within reach_m along the way of a place, evenly thinned to `most`; the place itself is one."""
         travel = self.snapshot.travel_m
-        rows = np.flatnonzero(np.abs(travel[:key] - travel[place]) < reach_m)
+        rows = np.flatnonzero((np.abs(travel[:key] - travel[place]) < reach_m) & self.snapshot.views.is_there()[:key])
         rows = rows[travel[key] - travel[rows] > 0.5 * self.settings.apart_m]
         if len(rows) > most:
             rows = rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.int64))]

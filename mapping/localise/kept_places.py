@@ -37,9 +37,10 @@ class _Entry:
 
 
 class KeptPlaces:
-    """What is kept, by place. Serials rise with time."""
+    """What is kept, by place: at most so much of each. Serials rise with time."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = MOST) -> None:
+        self._most = most
         self._cells: dict[Cell, list[_Entry]] = {}
         self._cell_of: dict[int, Cell] = {}
 
@@ -54,7 +55,7 @@ class KeptPlaces:
         entries.append(_Entry(serial, profile))
         self._cell_of[serial] = cell
         gone = []
-        while len(entries) > MOST:
+        while len(entries) > self._most:
             entry = entries.pop(_least_needed(entries))
             del self._cell_of[entry.serial]
             gone.append(entry.serial)

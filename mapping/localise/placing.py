@@ -83,13 +83,13 @@ class Placing:
 
     def _searched(self, view: View, near: Pose2, window_m: float, turn_rad: float) -> Place | None:
         """The best place around, if the scan really fits there."""
-        rows = nearest_keys(self.poses, near, AROUND_M, KEYS)
+        rows = nearest_keys(self.poses, near, AROUND_M, KEYS, self.views.is_there())
         raster = raster_of(self.views, rows, self.poses[rows], window_m=window_m)
         spot = find_view(view, raster, near, window_m=window_m, turn_rad=turn_rad)
         return None if spot is None or spot.score < SCORE else self._fitting(view, spot.pose)
 
     def _fitting(self, view: View, pose: Pose2) -> Place | None:
-        rows = nearest_keys(self.poses, pose, AROUND_M, 8)
+        rows = nearest_keys(self.poses, pose, AROUND_M, 8, self.views.is_there())
         match = fitting_match(view, self.views, rows, self.poses[rows], pose)
         if match is None:
             return None

@@ -123,7 +123,7 @@ def match_view(
     weight = prior * (POINT_SIGMA_M**2 * max(1, len(rows)))
     align(
         view.x, view.y, view.nx, view.ny, view.quality,
-        store.x, store.y, store.nx, store.ny, store.quality, store.frames, rows, poses,
+        store.x, store.y, store.nx, store.ny, store.quality, store.frames, store.rows(rows), poses,
         at, weight, np.asarray(reach.reach_m), np.asarray(reach.scale_m), MOST_STEPS, result,
     )  # fmt: skip
     if result[RESULT_STEPS] <= 0.0 or result[RESULT_COUNT] < 3.0 or not np.all(np.isfinite(result)):
@@ -148,7 +148,8 @@ def agreement(
     votes = np.zeros(3)
     at = np.array([pose.x_m, pose.y_m, pose.yaw_rad])
     compare(
-        view.x, view.y, view.quality, store.x, store.y, store.quality, store.frames, rows, poses, at, near_m, votes
+        view.x, view.y, view.quality, store.x, store.y, store.quality, store.frames, store.rows(rows), poses,
+        at, near_m, votes,
     )  # fmt: skip
     n = max(1.0, float(votes.sum()))
     return Agreement(float(votes[0]) / n, float(votes[1]) / n, float(votes[2]) / n, int(votes.sum()))

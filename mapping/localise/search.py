@@ -61,7 +61,7 @@ def raster_of(store: ViewArrays, rows: I64, poses: F64, *, window_m: float = 0.0
     x0, y0 = (float(v) - margin for v in poses[:, :2].min(axis=0))
     x1, y1 = (float(v) + FARTHEST_M for v in poses[:, :2].max(axis=0))
     fine = np.zeros((math.ceil((y1 - y0) / RESOLUTION_M) + 1, math.ceil((x1 - x0) / RESOLUTION_M) + 1), dtype=np.uint8)
-    draw_points(store.x, store.y, store.quality, rows, poses, x0, y0, RESOLUTION_M, fine)
+    draw_points(store.x, store.y, store.quality, store.rows(rows), poses, x0, y0, RESOLUTION_M, fine)
     pooled = pool(fine, block)
     if not is_wide:
         return Raster(fine, pooled, block, pooled, block, x0, y0)

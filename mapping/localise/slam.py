@@ -42,6 +42,7 @@ from mapping.localise.closures import (
     floored,
     turned_information,
 )
+from mapping.localise.kept_places import KeptPlaces
 from mapping.localise.pose_graph import Edges, composed_poses
 from mapping.localise.scan_match import Match, Reach, agreement, match_view, weakest_information
 from mapping.localise.search import find_view, raster_of
@@ -50,6 +51,7 @@ from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 Progress = Callable[[int, int], None]
 
 NEARBY = Reach((0.30, 0.22, 0.18, 0.15), (0.08, 0.06, 0.05, 0.04))
@@ -63,6 +65,8 @@ FINISHING_PASSES = 4
 WORTH_ANOTHER_PASS = 3  # closures gained in one
 PLACED_EXPLAINED = 0.6
 PLACED_OVERLAP = 0.85  # doors and chairs were moved since
+MOST_KEYS = 24  # key scans of one place whose views are kept, see KeptPlaces
+RESORTED_M = 0.1  # key scans that move more are sorted anew
 CLEARLY = 1.1  # times better a match must be to be believed against the prediction
 CLEARLY_PER_DEVIATION = 0.04  # and so much more for each deviation beyond the gate
 MOST_BEYOND = 20.0
@@ -224,6 +228,8 @@ class Slam:
         self._keep_scans = keep_scans
         self._sensors: dict[str, _Sensor] = {}
         self._views = ViewStore()
+        self._places = KeptPlaces(MOST_KEYS)
+        self._may_go: set[int] = set()  # key scans whose views are given up once nothing needs them
         self._poses: F64 = np.zeros((64, 3))  # map_from_sensor of key scans
         self._travel: F64 = np.zeros(64)
         self._base_from_sensor: list[Pose2] = []
@@ -284,6 +290,8 @@ class Slam:
         inverses = [each.inverse() for each in self._base_from_sensor]
         self._sensor_from_base = [(p.x_m, p.y_m, p.yaw_rad) for p in inverses]
         self._key_stamps = state.stamps.tolist()
+        for row in np.flatnonzero(self._views.arrays().is_there()).tolist():
+            self._may_go.update(self._places.add(row, "", state.poses[row], None))
         self._path = [(Pose2(*z), w) for z, w in zip(state.path.tolist(), state.information)]
         self.closures, self.closure_weight = state.closures, state.weight.copy()
         self.epoch, self._next_number, self._looked_at = state.epoch, state.next_number, n
@@ -301,7 +309,10 @@ class Slam:
         if view is None:
             return None
         guess = map_from_base @ base_from_sensor
-        rows = nearest_keys(self._poses[: len(self._views)], guess, self.settings.near_m, self.settings.references)
+        rows = nearest_keys(
+            self._poses[: len(self._views)], guess, self.settings.near_m, self.settings.references,
+            self._views.arrays().is_there(),
+        )  # fmt: skip
         match = fitting_match(view, self._views.arrays(), rows, self._poses[rows], guess)
         if match is None:
             return None
@@ -509,6 +520,11 @@ class Slam:
                 before, self._key_covariance, measured, np.linalg.inv(information)
             )
         self._key_odom = odom_from_sensor
+        self._may_go.update(self._places.add(key, "", self._poses[key], None))
+        needed = min(self._looked_at, key - self.settings.references)
+        gone = sorted(number for number in self._may_go if number < needed)
+        self._views.give_up(gone)
+        self._may_go.difference_update(gone)
 
     def _path_information(self, before: Pose2, measured: Pose2, match: Match | None, odom: Pose2 | None) -> F64:
         """Of a key scan's pose seen from the one before: what the match holds, and what odometry holds."""
@@ -613,6 +629,8 @@ class Slam:
         moved = float(np.abs(result.poses[:, :2] - self._poses[:known, :2]).max(initial=0.0))
         if moved > 0.0:
             tail = self._poses[known:n].copy()
+            far = np.flatnonzero(np.abs(result.poses[:, :2] - self._poses[:known, :2]).max(axis=1) > RESORTED_M)
+            self._places.move(far.tolist(), result.poses[far])
             correction = after @ before.inverse()
             self._poses[:known] = result.poses
             self._poses[known:n] = composed_poses(_row(correction), tail)
@@ -682,10 +700,10 @@ class Slam:
     def _look_again(self, done: int, total: int, progress: Progress | None) -> None:
         """Look for closures of the key scans that have none, then let the graph settle: a loop that was closed
         late brings others within reach."""
-        n = len(self._views)
+        n, there = len(self._views), self._views.arrays().is_there()
         for first in range(0, n, 40):
             closed = {c.to for c in self.closures}
-            keys = tuple(k for k in range(first, min(n, first + 40)) if k not in closed)
+            keys = tuple(k for k in range(first, min(n, first + 40)) if k not in closed and there[k])
             if keys:
                 self._do(self._snapshot(keys))
             if progress is not None:
@@ -805,9 +823,12 @@ class Slam:
         return composed_poses(self._poses[: len(self._views)], np.array(self._sensor_from_base).reshape(-1, 3))
 
 
-def nearest_keys(poses: F64, near: Pose2, within_m: float, most: int) -> I64:
-    """Key scans (K, 3) around a place, the nearest first, those seen from the same side before others; at least one."""
-    distance = np.hypot(poses[:, 0] - near.x_m, poses[:, 1] - near.y_m)
+def nearest_keys(poses: F64, near: Pose2, within_m: float, most: int, there: Bools) -> I64:
+    """Key scans (K, 3) around a place, the nearest first, those seen from the same side before others; at least one.
+
+    there: (K,) those whose views are still kept.
+    """
+    distance = np.where(there, np.hypot(poses[:, 0] - near.x_m, poses[:, 1] - near.y_m), np.inf)
     order = np.argsort(distance + 1.0 - np.cos(poses[:, 2] - near.yaw_rad), kind="stable")
     close = order[distance[order] < within_m][:most]
     return close if len(close) else order[:1]

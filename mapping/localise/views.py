@@ -8,6 +8,7 @@ comparable by index, and memory is bounded by the number of views alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ NARROWEST_RAD = math.radians(0.25)
 WIDEST_RAD = math.radians(4.0)
 MARGIN_RAD = math.radians(6.0)  # beams that de-skewing turns out of the first sweep's field of view
 ROUGHNESS_M = 0.02
+LEAST_GIVEN_UP = 64  # views, before the arrays are made anew without them
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,10 @@ def table_of(frame: F64) -> BearingTable:
     return BearingTable(first, width, int(bins), closed > 0.0)
 
 
+NO_TABLE = BearingTable(0.0, 0.0, 0, False)
+"""Of a view that was given up."""
+
+
 @dataclass(frozen=True, slots=True)
 class View:
     """One sweep in a table's bins; arrays (B,) float32 as described in mapping.kernels.localise_match."""
@@ -105,7 +111,10 @@ def view_of(scan: Scan, table: BearingTable, *, farthest_m: float) -> View:
 
 @dataclass(frozen=True, slots=True)
 class ViewArrays:
-    """Views 0 .. count - 1 of a store, as kernels take them: (K, B) each, and their frames (K, 4)."""
+    """Views 0 .. count - 1 of a store, as kernels take them: (K, B) each, and their frames (K, 4).
+
+    row: (count,) where each view stands in the arrays, -1 if it was given up; None: where its number says.
+    """
 
     count: int
     x: F32
@@ -114,21 +123,41 @@ class ViewArrays:
     ny: F32
     quality: F32
     frames: F64
+    row: I64 | None = None
 
-    def view(self, row: int) -> View:
-        """A kept view again."""
+    def rows(self, numbers: I64) -> I64:
+        """Where views (R,) stand in the arrays; none of them may be given up."""
+        return numbers if self.row is None else self.row[numbers]
+
+    def is_there(self) -> NDArray[np.bool_]:
+        """(count,) False for views that were given up."""
+        return np.ones(self.count, dtype=np.bool_) if self.row is None else self.row >= 0
+
+    def view(self, number: int) -> View:
+        """A kept view again; one without bins if it was given up."""
+        row = number if self.row is None else int(self.row[number])
+        if row < 0:
+            nothing = np.zeros(0, dtype=np.float32)
+            return View(NO_TABLE, nothing, nothing, nothing, nothing, nothing, 0, 0)
         table = table_of(self.frames[row])
         x, y, nx, ny, quality = (a[row, : table.bins] for a in (self.x, self.y, self.nx, self.ny, self.quality))
         return View(table, x, y, nx, ny, quality, int(np.sum(quality > EMPTY)), int(np.sum(quality > 0.0)))
 
 
 class ViewStore:
-    """Views that are kept, in the order they came. Rows below `len` never change, so `arrays()` may go to a thread."""
+    """Views that are kept, in the order they came. What `arrays()` handed out never changes, so it may go to a thread.
+
+    Views may be given up; the numbers of the others stay.
+    """
 
     def __init__(self) -> None:
-        self._count = 0
+        self._rows = 0  # in use
         self._arrays = [np.zeros((0, 0), dtype=np.float32) for _ in range(5)]
         self._frames: F64 = np.zeros((0, 4))
+        self._row: I64 = np.zeros(64, dtype=np.int64)  # of each view
+        self._count = 0
+        self._given_up: set[int] = set()  # still in the arrays
+        self._has_gaps = False
 
     def __len__(self) -> int:
         return self._count
@@ -139,29 +168,56 @@ class ViewStore:
         return sum(a.nbytes for a in self._arrays) + self._frames.nbytes
 
     def add(self, view: View) -> int:
-        """Keep a view; returns its row."""
+        """Keep a view; returns its number. One without bins is given up from the start."""
+        number = self._count
+        if number == len(self._row):
+            self._row = np.concatenate((self._row, np.zeros_like(self._row)))
+        self._row[number] = self._put(view) if view.table.bins else -1
+        self._has_gaps = self._has_gaps or not view.table.bins
+        self._count += 1
+        return number
+
+    def _put(self, view: View) -> int:
         rows, bins = self._arrays[0].shape
-        if self._count == rows or view.table.bins > bins:
-            self._grow(rows if self._count < rows else max(64, rows + rows // 2), max(bins, view.table.bins))
-        row, width = self._count, view.table.bins
+        if self._rows == rows or view.table.bins > bins:
+            self._grow(rows if self._rows < rows else max(64, rows + rows // 2), max(bins, view.table.bins))
+        row, width = self._rows, view.table.bins
         for kept, new in zip(self._arrays, (view.x, view.y, view.nx, view.ny, view.quality)):
             kept[row, :width] = new
         self._frames[row] = view.table.frame()
-        self._count += 1
+        self._rows += 1
         return row
+
+    def give_up(self, numbers: Iterable[int]) -> None:
+        """Forget views; they may stay in the arrays for a while, till it is worth making new ones."""
+        self._given_up.update(number for number in numbers if self._row[number] >= 0)
+        if len(self._given_up) >= max(LEAST_GIVEN_UP, (self._rows - len(self._given_up)) // 4):
+            self._close_up()
+
+    def _close_up(self) -> None:
+        row = self._row.copy()
+        row[list(self._given_up)] = -1
+        self._given_up.clear()
+        stays = np.flatnonzero(row[: self._count] >= 0)
+        chosen = row[stays]
+        row[stays] = np.arange(len(stays))
+        self._arrays = [a[chosen] for a in self._arrays]
+        self._frames = self._frames[chosen]
+        self._row, self._rows, self._has_gaps = row, len(stays), True
 
     def arrays(self) -> ViewArrays:
         """What is kept so far; later views appear in later calls only."""
         x, y, nx, ny, quality = self._arrays
-        return ViewArrays(self._count, x, y, nx, ny, quality, self._frames)
+        row = self._row[: self._count].copy() if self._has_gaps else None
+        return ViewArrays(self._count, x, y, nx, ny, quality, self._frames, row)
 
     def _grow(self, rows: int, bins: int) -> None:
         """Into new arrays: what was handed out stays as it is."""
         grown = []
         for index, old in enumerate(self._arrays):
             new = np.full((rows, bins), EMPTY if index == 4 else 0.0, dtype=np.float32)
-            new[: self._count, : old.shape[1]] = old[: self._count]
+            new[: self._rows, : old.shape[1]] = old[: self._rows]
             grown.append(new)
         frames = np.zeros((rows, 4))
-        frames[: self._count] = self._frames[: self._count]
+        frames[: self._rows] = self._frames[: self._rows]
         self._arrays, self._frames = grown, frames

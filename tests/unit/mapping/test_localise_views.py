@@ -130,3 +130,37 @@ def test_quick_bearings_are_bearings() -> None:
         assert bearing_of(x, y) == pytest.approx(math.atan2(y, x), abs=1e-5)
     for x, y in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (-1.0, 1e-300)):
         assert bearing_of(x, y) == pytest.approx(math.atan2(y, x), abs=1e-5)
+
+
+def test_views_that_were_given_up_leave_the_numbers_of_the_others() -> None:
+    bearing = np.linspace(-math.pi / 2.0, math.pi / 2.0, 91)
+    table, store = table_for(bearing), ViewStore()
+    scans = [Scan(k, 0.0, bearing, np.full(91, 1.0 + 0.01 * k), 0.05, 10.0) for k in range(400)]
+    for scan in scans[:300]:
+        store.add(view_of(scan, table, farthest_m=30.0))
+    before, size = store.arrays(), store.memory_bytes
+    store.give_up(range(0, 280, 2))
+    after = store.arrays()
+    assert store.memory_bytes < 0.6 * size
+    assert after.is_there().sum() == 160
+    assert not after.is_there()[:280:2].any()
+    for number in (1, 279, 280, 299):
+        np.testing.assert_array_equal(after.view(number).x, before.view(number).x)
+    assert after.view(0).points == 0
+    for scan in scans[300:]:
+        store.add(view_of(scan, table, farthest_m=30.0))
+    assert len(store) == 400
+    np.testing.assert_allclose(store.arrays().view(399).x, view_of(scans[399], table, farthest_m=30.0).x)
+    assert before.view(0).points == 91  # what was handed out stays
+
+
+def test_views_are_bounded_by_what_is_not_given_up() -> None:
+    bearing = np.linspace(-math.pi / 2.0, math.pi / 2.0, 91)
+    table, store = table_for(bearing), ViewStore()
+    most = 0
+    for k in range(3000):
+        store.add(view_of(Scan(k, 0.0, bearing, np.full(91, 2.0), 0.05, 10.0), table, farthest_m=30.0))
+        if k >= 100:
+            store.give_up([k - 100])
+        most = max(most, store.memory_bytes)
+    assert most < 500 * (91 + 40) * 20
