@@ -3,7 +3,8 @@
     UMFELD_DATA=folder .venv/bin/python bench/slam_large.py [CASE ...] [--seeds 1 2] [--json FILE] [--draw FOLDER]
 
 Cases: buildings of the simulator (mit: 2 km of corridor, mit8: seen up to 8 m, plain: without a door or a bin between
-the crossings, halls: two loops of 400 m, bare: one of 230 m, plain too), 180 degrees at 1 degree as an old SICK, and
+the crossings, halls: two loops of 400 m, alike: parallel corridors 7.5 m apart, alike_plain: those without doors, bare:
+one loop of 230 m without doors), 180 degrees at 1 degree as an old SICK, and
 recordings whose poses others corrected (belgioioso, seattle, acapulco). Odometry is made from the true poses: a scale
 that is off, turns that are off, a heading that drifts and wanders, slips (`Wheels`).
 
@@ -108,6 +109,10 @@ HALLS = BigBuilding(
     tour=((0, 0), (2, 0), (2, 1), (0, 1), (0, 0), (1, 0), (1, 1), (0, 1), (0, 0), (1, 0)), open_share=0.2,
 )  # fmt: skip
 BARE = BigBuilding(columns_m=(0.0, 70.0), rows_m=(0.0, 45.0), tour=((0, 0), (1, 0), (1, 1), (0, 1)) * 2, bare=True)
+ALIKE = BigBuilding(
+    columns_m=(0.0, 20.0, 40.0, 60.0, 80.0, 100.0, 120.0), rows_m=(0.0, 7.5, 15.0, 22.5), half_m=1.0,
+    tour=((0, 0), (6, 0), (6, 1), (0, 1), (0, 2), (6, 2), (6, 3), (0, 3), (0, 0), (6, 0), (6, 1)),
+)  # fmt: skip
 
 
 def simulated(name: str, building: BigBuilding, seed: int, *, range_m: float = 30.0, hertz: float = 5.0) -> Case:
@@ -151,6 +156,8 @@ CASES: dict[str, Callable[[int], Case]] = {
     "mit8": partial(simulated, "mit8", MIT, range_m=8.0),
     "plain": partial(simulated, "plain", replace(MIT, bare=True)),
     "halls": partial(simulated, "halls", HALLS),
+    "alike": partial(simulated, "alike", ALIKE),
+    "alike_plain": partial(simulated, "alike_plain", replace(ALIKE, bare=True)),
     "bare": partial(simulated, "bare", BARE),
     "belgioioso": lambda seed: recorded("belgioioso", seed, seed_of_wheels=seed),
     "seattle": lambda seed: recorded("seattle", seed, seed_of_wheels=seed),

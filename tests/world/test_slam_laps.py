@@ -10,6 +10,9 @@ import pytest
 from mapping.frames import Pose2
 from mapping.localise.slam import Slam, run_here
 from mapping.scan import Scan
+from service.background import at_once
+from service.redraw import Redrawer
+from service.slam_store import Stored, stored_of, tiles_of
 
 BEARING = np.radians(np.arange(-90.0, 91.0, 2.0))
 LAP, LAPS = 60, 50
@@ -53,7 +56,14 @@ def test_fifty_laps_of_a_room_keep_the_views_of_some() -> None:
     assert max(off) < 0.05
     assert len(slam.closures) > 100
     slam.finish()
+    there = slam.state().views.is_there()
+    redrawer = Redrawer([], None, {}, submit=at_once)
+    stored = stored_of(tiles_of(Stored(slam.state(), redrawer.state())))
+    assert stored is not None
+    np.testing.assert_array_equal(stored.slam.views.is_there(), there)
+    newest = np.flatnonzero(there)[-1]
+    np.testing.assert_allclose(stored.slam.views.view(newest).x, slam.state().views.view(newest).x, atol=6e-4)
     again = Slam(keep_scans=False)
-    again.resume(slam.state())
+    again.resume(stored.slam)
     pose, scan = sweep(7, rng)
     assert again.join(scan, pose) is not None
