@@ -4,9 +4,9 @@
 
 Cases: buildings of the simulator (mit: 2 km of corridor, mit8: seen up to 8 m, plain: without a door or a bin between
 the crossings, halls: two loops of 400 m, alike: parallel corridors 7.5 m apart, alike_plain: those without doors, bare:
-one loop of 230 m without doors), 180 degrees at 1 degree as an old SICK, and
-recordings whose poses others corrected (belgioioso, seattle, acapulco). Odometry is made from the true poses: a scale
-that is off, turns that are off, a heading that drifts and wanders, slips (`Wheels`).
+one loop of 230 m without doors), 180 degrees at 1 degree as an old SICK, and recordings whose poses others corrected
+(belgioioso, seattle, acapulco). Odometry is made from the true poses: a scale that is off, turns that are off, a
+heading that drifts and wanders, slips (`Wheels`).
 
 A pair of visits: scans less than PAIR_M and PAIR_RAD apart in truth and at least 60 s and 30 m of way apart. Its error
 is what the relation error of the benchmark is: inverse(true) * (inverse(a) * b).  A closure is false if it is off the
