@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.kernels.localise_match import nearest_bin
+from mapping.kernels.localise_search import pool, pool_again
 from mapping.localise.scan_match import Reach, agreement, match_view, weakest_information
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.views import View, ViewStore, table_for, view_of
@@ -191,6 +192,23 @@ def test_blocks_do_not_hide_the_best(window_m: float) -> None:
             for dx in range(-10, 11):
                 best = max(best, float(raster.fine[v + dy, u + dx].sum()) / (255.0 * len(chosen)))
     assert found.score >= best - 0.02
+
+
+def test_maxima_over_wide_blocks_come_from_those_over_small_ones() -> None:
+    fine = np.random.default_rng(2).integers(0, 255, (70, 90)).astype(np.uint8)
+    np.testing.assert_array_equal(pool_again(pool(fine, 8), 8, 4), pool(fine, 32))
+
+
+def test_one_rival_is_enough_where_more_need_not_be_known() -> None:
+    store = store_of(CORRIDOR, [Pose2(0.0, 0.0, 0.0)])
+    raster = raster_of(store.arrays(), np.arange(1), rows_of([Pose2()]), window_m=8.0)
+    view = seen(CORRIDOR, Pose2())
+    found = find_view(view, raster, Pose2(), window_m=8.0, turn_rad=0.2, doubtful_share=0.85)
+    every = find_view(view, raster, Pose2(), window_m=8.0, turn_rad=0.2)
+    assert found is not None
+    assert every is not None
+    assert found.pose == every.pose
+    assert 0.85 < found.rival <= every.rival
 
 
 def test_a_schedule_has_all_its_levels() -> None:

@@ -1,0 +1,73 @@
+"""Votes of closures on probation: how many, from how much of the way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mapping.frames import Pose2
+from mapping.localise.closures import Closure, ClosureSettings, Snapshot, Work, edges_of
+from mapping.localise.pose_graph import Edges
+from mapping.localise.scan_match import Agreement
+from mapping.localise.views import ViewStore
+
+STEP_M = 0.8
+AGAIN = 100  # key scans after which the way begins anew
+ROUGH = ClosureSettings().rough_worth
+
+
+def work(votes: int, worth: float, step_m: float = STEP_M) -> tuple[Work, list[Closure]]:
+    """A straight way driven twice, in truth 5 m beside where it is thought to be the second time."""
+    keys = np.arange(2 * AGAIN)
+    poses = np.stack((keys % AGAIN * step_m, 0.0 * keys, 0.0 * keys), axis=-1)
+    path = Edges.none()
+    shot = Snapshot(ViewStore().arrays(), poses, keys * step_m, path, (), (), (), 0, 0)
+    pending = [Closure(k, AGAIN + k, Pose2(0.0, 5.0), np.eye(3), worth, True) for k in range(votes)]
+    return Work(shot, ClosureSettings()), pending
+
+
+@pytest.mark.parametrize(
+    ("votes", "worth", "step_m", "are_enough"),
+    [
+        (2, 1.0, 0.8, False),
+        (3, 1.0, 0.8, True),
+        (3, 1.0, 0.5, False),  # 1 m of the way
+        (5, 0.5, 0.8, False),
+        (6, 0.5, 0.8, True),
+        (8, ROUGH, 0.8, False),
+        (9, ROUGH, 0.8, True),
+        (12, ROUGH, 0.5, False),  # 5.5 m of the way
+    ],
+)
+def test_so_many_votes_from_so_much_of_the_way_are_needed(
+    votes: int, worth: float, step_m: float, are_enough: bool
+) -> None:
+    judge, pending = work(votes, worth, step_m)
+    group, waiting = judge._agreeing(pending)
+    assert (len(group), len(waiting)) == ((votes, 0) if are_enough else (0, votes))
+
+
+def test_who_asks_for_another_correction_is_no_vote() -> None:
+    judge, pending = work(9, ROUGH)
+    pending[4] = Closure(4, AGAIN + 4, Pose2(1.5, 5.0), np.eye(3), ROUGH, True)
+    assert judge._agreeing(pending)[0] == []
+    assert len(edges_of(pending)) == 9
+
+
+@pytest.mark.parametrize(
+    ("agrees", "mean_cost", "weakest_per_m2", "worth"),
+    [
+        (Agreement(0.80, 0.02, 0.18, 100), 0.20, 1500.0, 1.0),
+        (Agreement(0.80, 0.02, 0.18, 100), 0.40, 1500.0, 0.5),
+        (Agreement(0.80, 0.02, 0.18, 100), 0.50, 1500.0, ROUGH),
+        (Agreement(0.80, 0.02, 0.18, 100), 0.20, 300.0, ROUGH),
+        (Agreement(0.80, 0.02, 0.18, 100), 0.20, 100.0, 0.0),  # a bare corridor
+        (Agreement(0.80, 0.02, 0.18, 100), 0.70, 1500.0, 0.0),
+        (Agreement(0.80, 0.06, 0.14, 100), 0.50, 1500.0, 0.0),  # it sees through what was there
+        (Agreement(0.60, 0.00, 0.40, 100), 0.50, 1500.0, 0.0),
+    ],
+)
+def test_what_a_single_closure_is_worth(
+    agrees: Agreement, mean_cost: float, weakest_per_m2: float, worth: float
+) -> None:
+    assert work(0, 1.0)[0]._worth(agrees, mean_cost, weakest_per_m2) == worth
