@@ -19,7 +19,8 @@ ROUGH = ClosureSettings().rough_worth
 def work(votes: int, worth: float, step_m: float = STEP_M) -> tuple[Work, list[Closure]]:
     """A straight way driven twice, in truth 5 m beside where it is thought to be the second time."""
     keys = np.arange(2 * AGAIN)
-    poses = np.stack((keys % AGAIN * step_m, 0.0 * keys, 0.0 * keys), axis=-1)
+    poses = np.zeros((2 * AGAIN, 3))
+    poses[:, 0] = keys % AGAIN * step_m
     path = Edges.none()
     shot = Snapshot(ViewStore().arrays(), poses, keys * step_m, path, (), (), (), 0, 0)
     pending = [Closure(k, AGAIN + k, Pose2(0.0, 5.0), np.eye(3), worth, True) for k in range(votes)]
