@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.localise.closures import Closure, ClosureSettings, Snapshot, Work, edges_of
@@ -18,8 +19,8 @@ ROUGH = ClosureSettings().rough_worth
 
 def work(votes: int, worth: float, step_m: float = STEP_M) -> tuple[Work, list[Closure]]:
     """A straight way driven twice, in truth 5 m beside where it is thought to be the second time."""
-    keys = np.arange(2 * AGAIN)
-    poses = np.zeros((2 * AGAIN, 3))
+    keys = np.arange(2.0 * AGAIN)
+    poses: NDArray[np.float64] = np.zeros((2 * AGAIN, 3))
     poses[:, 0] = keys % AGAIN * step_m
     path = Edges.none()
     shot = Snapshot(ViewStore().arrays(), poses, keys * step_m, path, (), (), (), 0, 0)
