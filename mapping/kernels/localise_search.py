@@ -127,6 +127,8 @@ def search(
                 at += 1
     order = np.argsort(-bounds, kind="mergesort")
     ratio = top_block // block
+    # Wide blocks reach beyond the window by up to 3 m: what drift cannot explain must not be found there.
+    most = math.ceil(window_m / resolution_m) if ratio > 1 else 2 * (blocks + 1) * top_block
     best, best_t, best_x, best_y = -1, 0, 0, 0
     for n in range(total):
         k = order[n]
@@ -140,6 +142,8 @@ def search(
                 continue
             for dy in range(my, my + block):
                 for dx in range(mx, mx + block):
+                    if dx * dx + dy * dy > most * most:
+                        continue
                     score = score_at(fine, cells_x[t], cells_y[t], dx, dy)
                     if score > best:
                         best, best_t, best_x, best_y = score, t, dx, dy
@@ -160,6 +164,8 @@ def search(
             for dy in range(my, my + block):
                 for dx in range(mx, mx + block):
                     if not turned and (dx - best_x) ** 2 + (dy - best_y) ** 2 < apart_cells * apart_cells:
+                        continue
+                    if dx * dx + dy * dy > most * most:
                         continue
                     score = score_at(fine, cells_x[t], cells_y[t], dx, dy)
                     if score > second:
