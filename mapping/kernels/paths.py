@@ -499,17 +499,20 @@ def sees(squared: Any, need: float, r0: float, c0: float, r1: float, c1: float) 
     step_r, step_c = (1 if dr > 0.0 else -1), (1 if dc > 0.0 else -1)
     leave_r = (0.5 + step_r * (r - r0)) * per_r
     leave_c = (0.5 + step_c * (c - c0)) * per_c
+    on = 0.0
     while True:
         value = squared[r, c]
         if value < need2:
             return False
         if value > far2:
-            t = (
-                min(leave_r, leave_c) + math.sqrt(value) - need - 2.8285
-            )  # a cell's diagonal less, t may be past the cell
+            # A cell's diagonal less, since it was entered up to that before it is left. Rounding may tell a line that
+            # runs along a border of cells to leave at once, for ever: `on` never falls back.
+            leave = max(min(leave_r, leave_c), on)
+            t = leave + math.sqrt(value) - need - 2.8285
             if t >= length:
                 return True
-            if t > min(leave_r, leave_c):
+            if t > leave:
+                on = t
                 r, c = math.floor(r0 + t / length * dr + 0.5), math.floor(c0 + t / length * dc + 0.5)
                 leave_r = (0.5 + step_r * (r - r0)) * per_r
                 leave_c = (0.5 + step_c * (c - c0)) * per_c
@@ -555,16 +558,17 @@ def sees_by_room(room: Any, r0: float, c0: float, r1: float, c1: float) -> bool:
     step_r, step_c = (1 if dr > 0.0 else -1), (1 if dc > 0.0 else -1)
     leave_r = (0.5 + step_r * (r - r0)) * per_r
     leave_c = (0.5 + step_c * (c - c0)) * per_c
+    on = 0.0
     while True:
         value = room[r, c]
         if value == 0:
             return False
         leave = min(leave_r, leave_c)
         if value > 3:
-            t = leave + (value - 2.5)  # less what the line takes through this cell, at most, and 1
-            if t >= length:
+            on = max(leave, on) + (value - 2.5)  # less what the line takes through this cell, at most, and 1
+            if on >= length:
                 return True
-            r, c = int(r0 + t * ur + 0.5), int(c0 + t * uc + 0.5)
+            r, c = int(r0 + on * ur + 0.5), int(c0 + on * uc + 0.5)
             leave_r = (0.5 + step_r * (r - r0)) * per_r
             leave_c = (0.5 + step_c * (c - c0)) * per_c
             continue

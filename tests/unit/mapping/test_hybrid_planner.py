@@ -212,3 +212,23 @@ def test_tables_of_many_clearances_are_let_go() -> None:
     lengths = [planner.plan(place(20, 20), place(60, 30), clearance_m=0.01 * k).way.length_m for k in range(8)]
     assert len(planner._tables) <= 4
     assert planner.plan(place(20, 20), place(60, 30), clearance_m=0.0).way.length_m == lengths[0]
+
+
+def test_sight_along_the_borders_of_cells_comes_to_an_end() -> None:
+    """Where a line that leaves its row at once, by rounding, went on from the same place for ever."""
+    free = np.zeros((60, 200), dtype=np.bool_)
+    free[2:58, 2:198] = True
+    squared = VoronoiGrid(free).field.squared
+    room = np.empty(squared.shape, dtype=np.uint8)
+    kernels.measure_room(squared, 3.0, room)
+    for lean in (0.0, 1e-17, -1e-15, 1e-12, -1e-9, 1e-6):
+        for at in (20.5, 30.0, 30.5):
+            for a, b in ((10.0, 180.5), (180.5, 10.0), (10.5, 180.5)):
+                assert kernels.sees_by_room(room, at, a, at + lean, b)
+                assert kernels.sees(squared, 3.0, at, a, at + lean, b)
+    tall = np.ascontiguousarray(squared.T)
+    room = np.ascontiguousarray(room.T)
+    for at in (20.5, 30.0, 30.5):
+        for a, b in ((10.0, 180.5), (180.5, 10.0)):
+            assert kernels.sees_by_room(room, a, at, b, at)
+            assert kernels.sees(tall, 3.0, a, at, b, at)
