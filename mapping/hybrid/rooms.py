@@ -23,6 +23,9 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
 
+_END_M = 0.1  # around the end of a critical line: what stands there
+
+
 @dataclass(frozen=True, slots=True)
 class RoomRules:
     """When two pieces of free space are one room. One set for all maps.
@@ -35,8 +38,8 @@ class RoomRules:
     The other cuts are judged by a sum. It rises with the clearance in the passage, as a share of the mean clearance of
     the piece where that is less (narrow_weight) and more (wide_weight), and with the share of the smaller piece's
     outline that is open (open_weight). It falls with the clearance in metres (large_weight), and with the sharpness
-    of the corners on both sides, of the blunter (jamb_weight) and the sharper one (edge_weight). Above join it is no
-    door.
+    of the corners on both sides, of the blunter (jamb_weight, up to blunt_most) and the sharper one (edge_weight, up to
+    sharp_most). Above join it is no door.
     """
 
     clutter_m: float = 1.0
@@ -45,12 +48,14 @@ class RoomRules:
     keep: float = 0.95
     slack_m: float = 0.0125
     narrow_weight: float = 0.4
-    wide_weight: float = 0.75
+    wide_weight: float = 0.72
     open_weight: float = 1.1
-    large_weight: float = 1.0
-    jamb_weight: float = 0.55
-    edge_weight: float = 0.3
-    join: float = 0.15
+    large_weight: float = 0.88
+    jamb_weight: float = 0.58
+    blunt_most: float = 1.4
+    edge_weight: float = 0.35
+    sharp_most: float = 1.5
+    join: float = 0.19
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,12 +200,12 @@ class _Pieces:
         self.cuts: list[dict[int, _Cut]] = [{} for _ in range(count)]
         self._cell_m = resolution_m
         found = _contacts(basin, field.squared)
-        points, lengths = _widest_contacts(found, count)
+        points, lengths, widest, first = _widest_contacts(found, count)
         ruled = np.zeros(basin.shape, dtype=np.int32)
         kernels.count_ruled(field.site, field.squared, ruled)
-        ends = np.empty((len(points), 4), dtype=np.int32)
         sharpness = np.empty((len(points), 2))
-        kernels.jambs(field.site, field.squared, ruled, points[:, kernels.ROW :], ends, sharpness)
+        reach = max(round(_END_M / resolution_m), 1)
+        kernels.jambs(field.site, field.squared, ruled, widest[:, kernels.ROW :], first, reach, sharpness)
         for (a, b, squared, _, _), length, (blunt, sharp) in zip(points.tolist(), lengths, sharpness.tolist()):
             cut = _Cut(math.sqrt(squared), float(length), blunt, sharp)
             self.cuts[a][b] = cut
@@ -259,8 +264,8 @@ class _Pieces:
             + rules.wide_weight * min(cut.clearance / max(means), 2.0)
             + rules.open_weight * cut.length / self.outline[smaller]
             - rules.large_weight * cut.clearance * self._cell_m
-            - rules.jamb_weight * min(cut.blunt, 1.0)
-            - rules.edge_weight * min(cut.sharp, 2.0)
+            - rules.jamb_weight * min(cut.blunt, rules.blunt_most)
+            - rules.edge_weight * min(cut.sharp, rules.sharp_most)
         )
 
     def _join(self, a: int, b: int) -> int:
@@ -292,12 +297,16 @@ def _contacts(basin: I32, squared: I32) -> I32:
     return found[:n]
 
 
-def _widest_contacts(found: I32, count: int) -> tuple[I32, NDArray[np.int64]]:
-    """(M, 5) the contact of greatest clearance of each pair of basins, first in reading order; (M,) how many it has."""
+def _widest_contacts(found: I32, count: int) -> tuple[I32, NDArray[np.int64], I32, NDArray[np.int64]]:
+    """Of each pair of basins (M, 5) the contact of greatest clearance, first in reading order; (M,) how many it has;
+    and all contacts of that clearance (K, 5), those of pair i from first[i] to first[i + 1]."""
     pair = found[:, kernels.LOWER].astype(np.int64) * count + found[:, kernels.UPPER]
     order = np.lexsort((-found[:, kernels.SQUARED], pair))  # stable: reading order within
-    _, first, lengths = np.unique(pair[order], return_index=True, return_counts=True)
-    return found[order[first]], lengths
+    _, begins, which, lengths = np.unique(pair[order], return_index=True, return_inverse=True, return_counts=True)
+    sorted_, most = found[order], found[order[begins], kernels.SQUARED]
+    equal = sorted_[:, kernels.SQUARED] == most[which]
+    first = np.searchsorted(which[equal], np.arange(len(begins) + 1))
+    return sorted_[begins], lengths, sorted_[equal], first
 
 
 def _number_rooms(basin: I32, pieces: _Pieces, room_min_cells: float) -> I32:

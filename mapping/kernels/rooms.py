@@ -250,27 +250,32 @@ def critical_line(site: Any, squared: Any, r: Any, c: Any, reach: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def jambs(site: Any, squared: Any, ruled: Any, points: Any, ends: Any, sharpness: Any) -> None:
+def jambs(site: Any, squared: Any, ruled: Any, points: Any, first: Any, reach: int, sharpness: Any) -> None:
     """What stands at the ends of critical lines.
 
-    points: (N, 2) critical points.  ends: (N, 4) int32 out, from critical_line.  sharpness: (N, 2) out: cells that
-    rule from the obstacle cells around each end, over the squared clearance: about nothing before a straight wall,
-    0.8 before a corner of 90 degrees, 1.6 and more before the end of a wall; the lesser first.
+    points: (K, 2) the critical points of passages, those of passage i, all equally wide, from first[i] to
+    first[i + 1].  reach: cells around an end that belong to it.  sharpness: (N, 2) out, means over a passage's cells:
+    cells that rule from the obstacle cells around each end, over the squared clearance: about nothing before a straight
+    wall, 0.8 before a corner of 90 degrees, 1.6 and more before the end of a wall; the lesser first.
     """
     rows, cols = site.shape
-    for i in range(points.shape[0]):
-        r, c = np.int64(points[i, 0]), np.int64(points[i, 1])
-        line = critical_line(site, squared, r, c, 2)
-        for e in range(2):
-            row, col = line[2 * e], line[2 * e + 1]
-            ends[i, 2 * e], ends[i, 2 * e + 1] = row, col
-            n = 0
-            for rr in range(max(row - 2, 0), min(row + 3, rows)):
-                for cc in range(max(col - 2, 0), min(col + 3, cols)):
-                    n += ruled[rr, cc]
-            sharpness[i, e] = n / squared[r, c]
-        if sharpness[i, 0] > sharpness[i, 1]:
-            sharpness[i, 0], sharpness[i, 1] = sharpness[i, 1], sharpness[i, 0]
+    for i in range(first.size - 1):
+        sharpness[i, 0] = sharpness[i, 1] = 0.0
+        for p in range(first[i], first[i + 1]):
+            r, c = np.int64(points[p, 0]), np.int64(points[p, 1])
+            line = critical_line(site, squared, r, c, reach)
+            blunt, sharp = np.inf, 0.0
+            for e in range(2):
+                row, col = line[2 * e], line[2 * e + 1]
+                n = 0
+                for rr in range(max(row - reach, 0), min(row + reach + 1, rows)):
+                    for cc in range(max(col - reach, 0), min(col + reach + 1, cols)):
+                        n += ruled[rr, cc]
+                sharp = max(sharp, n / squared[r, c])
+                blunt = min(blunt, n / squared[r, c])
+            sharpness[i, 0] += blunt
+            sharpness[i, 1] += sharp
+        sharpness[i] /= first[i + 1] - first[i]
 
 
 @njit(cache=True, nogil=True)

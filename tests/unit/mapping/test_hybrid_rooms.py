@@ -186,9 +186,39 @@ def test_sharpness_tells_a_wall_from_a_corner_from_the_end_of_a_wall() -> None:
     ruled = np.zeros(free.shape, dtype=np.int32)
     kernels.count_ruled(field.site, field.squared, ruled)
     assert ruled.sum() == free.sum()
-    points = np.array([[60, 60], [40, 60]], dtype=np.int32)
-    ends, sharpness = np.empty((2, 4), dtype=np.int32), np.empty((2, 2))
-    kernels.jambs(field.site, field.squared, ruled, points, ends, sharpness)
-    assert sorted(ends[0].reshape(2, 2).tolist()) == [[60, 54], [60, 67]]
+    points = np.array([[60, 60], [60, 61], [40, 60]], dtype=np.int32)
+    sharpness = np.empty((2, 2))
+    kernels.jambs(field.site, field.squared, ruled, points, np.array([0, 2, 3]), 2, sharpness)
+    line = kernels.critical_line(field.site, field.squared, 60, 60, 2)
+    assert sorted(np.array(line).reshape(2, 2).tolist()) == [[60, 54], [60, 67]]
     assert sharpness[0, 0] > 1.6  # both are ends of walls
     assert sharpness[1, 0] < 0.5  # midway between straight walls
+
+
+@pytest.mark.parametrize("turned_by", [0.0, 90.0, 180.0, 13.0, 30.0, 45.0])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_rooms_do_not_hang_on_how_a_plan_lies(turned_by: float, mirrored: bool) -> None:
+    free, truth = plan()
+    if mirrored:
+        free, truth = free[:, ::-1], truth[:, ::-1]
+    free = ndimage.rotate(free.astype(np.float64), turned_by, order=1) > 0.5
+    truth = ndimage.rotate(truth, turned_by, order=0)
+    check_rooms(find_rooms(free, CELL_M), truth)
+
+
+def check_rooms(found: RoomMap, truth: I32) -> None:
+    numbers = numbers_in(found, truth)
+    assert sorted(numbers) == [1, 2, 3, 4, 5] == [room.number for room in found.rooms]
+    for k, number in enumerate(numbers, start=1):
+        drawn, cells = truth == k, found.labels == number
+        assert (cells & drawn).sum() > 0.95 * max(drawn.sum(), cells.sum())
+
+
+@pytest.mark.parametrize("cell_m", [0.025, 0.1])
+def test_rooms_do_not_hang_on_the_cells(cell_m: float) -> None:
+    free, truth = plan()
+    if cell_m < CELL_M:
+        free, truth = (np.kron(each, np.ones((2, 2), dtype=each.dtype)) for each in (free, truth))
+    else:
+        free, truth = free[::2, ::2], truth[::2, ::2]
+    check_rooms(find_rooms(free, cell_m), truth)
