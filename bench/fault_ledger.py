@@ -34,7 +34,7 @@ SEEN_LEAST_MS = 60  # shorter pauses are those of USB hubs, adapters and schedul
 BACK_MS = 2000
 BASELINE_S, FAULT_S = 0.8, 0.8
 SLACK_M = 0.05  # sonars' noise of 5 mm, ten sigma
-POLL_MS = 20  # readers look at silence so often
+POLL_MS = 30  # readers turn every 20 ms at least, and look at silence every 10
 
 # ---- devices --------------------------------------------------------------------------------------------------------
 
