@@ -7,7 +7,8 @@ import contextlib
 import os
 import signal
 from collections.abc import Awaitable, Callable, Sequence
-from typing import TYPE_CHECKING, Annotated
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 DEFAULT_PORT = 8765
+DRAWN = ("scan/*", "range/*", "sectors/polar/*", "pose", "odom", "map/**", "health/json", "info")
+"""What page.js takes. Each key more costs the daemon: a subscriber makes a put several times as dear."""
+_RING = 256
 _DRAIN = 64
 
 
@@ -78,23 +82,23 @@ def _page_server() -> tuple[Callable[..., Awaitable[None]], frozenset[str]]:
 
 
 def _receive(client: Client, base: str, relay: Relay) -> Callable[[], None]:
-    """Subscribe to everything the robots publish and to their coming and going; returns what ends it."""
+    """Subscribe to what the page draws and to the robots' coming and going; returns what ends it."""
     import zenoh
 
     from service.topics import ALIVE
     from service.view import Pump
     from service.zenoh_session import subscribe_liveliness
 
-    samples = client.subscribe_latched(f"{base}/**", ring=1024)
+    samples = [client.subscribe_latched(f"{base}/{keys}", ring=_RING) for keys in DRAWN]
     tokens = subscribe_liveliness(client.session, f"{base}/{ALIVE}")
 
-    def take() -> Sequence[Sample] | None:
+    def take(subscriber: Any) -> Sequence[Sample] | None:
         try:
-            first = samples.recv()
+            first = subscriber.recv()
         except zenoh.ZError:
             return None
         batch = [_plain(first)]
-        while len(batch) < _DRAIN and (more := samples.try_recv()) is not None:
+        while len(batch) < _DRAIN and (more := subscriber.try_recv()) is not None:
             batch.append(_plain(more))
         return batch
 
@@ -106,12 +110,12 @@ def _receive(client: Client, base: str, relay: Relay) -> Callable[[], None]:
         relay.robot_from_thread(str(token.key_expr).removesuffix(f"/{ALIVE}"), str(token.kind) == "SampleKind.PUT")
         return ()
 
-    pumps = [Pump(take, relay), Pump(watch, relay)]
+    pumps = [*(Pump(partial(take, each), relay) for each in samples), Pump(watch, relay)]
     for pump in pumps:
         pump.start()
 
     def end() -> None:
-        for subscriber in (samples, tokens):
+        for subscriber in (*samples, tokens):
             with contextlib.suppress(zenoh.ZError):
                 subscriber.undeclare()
         for pump in pumps:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 
 import aiohttp
 import pytest
+import zenoh
 from aiohttp.test_utils import TestClient, TestServer
 
+import service.view
+from service.commands.view import DRAWN
 from service.relay import Sample
 from service.view import ALIVE_KEY, PAGES_MAX, Relay, make_app
 
@@ -112,3 +117,16 @@ def test_after_the_loop_has_closed_samples_are_dropped_quietly() -> None:
     loop.close()
     relay.from_thread([Sample("k", b"")])
     relay.robot_from_thread("robots/a", True)
+
+
+def test_every_key_that_the_page_takes_is_subscribed_to_and_no_more() -> None:
+    script = (Path(service.view.__file__).parent / "page" / "page.js").read_text()
+    taken = [
+        pattern.replace("([^/]+)", "x").replace("\\/", "/")
+        for pattern in re.findall(r"^ {2}\[/\^(.*)\$/,", script, re.M)
+    ]
+    assert len(taken) > 10
+    for key in taken:
+        assert any(zenoh.KeyExpr(drawn).includes(zenoh.KeyExpr(key)) for drawn in DRAWN), key
+    for drawn in DRAWN:
+        assert any(zenoh.KeyExpr(drawn).includes(zenoh.KeyExpr(key)) for key in taken), drawn
