@@ -380,9 +380,17 @@ let userMoved = false;
 // Until somebody moves the view, it shows all that is known.
 function frameWhenKnown(robot) {
   if (userMoved) return;
-  const box = robot.grid.bounds();
+  const box = robot.grid.bounds() ?? placesBox(robot.topo);
   if (box) camera.fit(...box);
   else if (robot.pose) { camera.x = robot.pose.x; camera.y = robot.pose.y; }
+}
+
+// Around the places of a robot that draws no grid.
+function placesBox(topo) {
+  const at = (topo?.nodes ?? []).map((node) => node.position).filter(Boolean);
+  if (!at.length) return null;
+  const xs = [...at.map((p) => p[0]), topo.robot?.[0] ?? at[0][0]], ys = [...at.map((p) => p[1]), topo.robot?.[1] ?? at[0][1]];
+  return [Math.min(...xs) - 1, Math.min(...ys) - 1, Math.max(...xs) + 1, Math.max(...ys) + 1];
 }
 
 function frame() {
