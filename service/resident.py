@@ -1,0 +1,51 @@
+"""What start-up touched and running does not need is given back: code of libraries that only compiled or loaded.
+
+Loading kernels walks through most of LLVM: some 70 MB of its code stay resident, to no use. Pages of code are clean
+copies of the file; dropped, those that are needed again come back from the page cache, a fault each.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from pathlib import Path
+
+_LEAST_BYTES = 4 << 20
+_MADV_DONTNEED = 4
+_RANGE = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (\S{4}) \S+ \S+ \d+ +(/.*)$")
+
+
+def give_back_code(least_bytes: int = _LEAST_BYTES) -> int:
+    """Drop the resident pages of large, unwritten code mappings of this process; how many bytes were resident there.
+
+    0 where the system does not tell its mappings.
+    """
+    try:
+        lines = Path("/proc/self/smaps").read_text().splitlines()
+        advise = ctypes.CDLL(None, use_errno=True).madvise
+    except (OSError, AttributeError):
+        return 0
+    advise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
+    given = 0
+    for start, stop, fields in _code_of_files(lines):
+        is_clean = fields["Private_Dirty"] == 0 and fields["Shared_Dirty"] == 0
+        if stop - start >= least_bytes and is_clean and advise(start, stop - start, _MADV_DONTNEED) == 0:
+            given += fields["Rss"] * 1024
+    return given
+
+
+def _code_of_files(lines: list[str]) -> list[tuple[int, int, dict[str, int]]]:
+    """Private executable mappings of files: start, stop, and their figures in kB."""
+    found: list[tuple[int, int, dict[str, int]]] = []
+    wanted = False
+    for line in lines:
+        if head := _RANGE.match(line):
+            wanted = head[3] == "r-xp"
+            if wanted:
+                found.append((int(head[1], 16), int(head[2], 16), {}))
+        elif re.match(r"^[0-9a-f]+-[0-9a-f]+ ", line):
+            wanted = False
+        elif wanted and line.endswith(" kB"):
+            name, _, rest = line.partition(":")
+            found[-1][2][name] = int(rest.split()[0])
+    return found

@@ -1,0 +1,61 @@
+"""Code that is not needed any more leaves the memory, and comes back when it is."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from service.resident import _code_of_files
+
+_TRY = """
+import numba, numpy as np
+from service.resident import give_back_code
+def resident():
+    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) * 1024
+@numba.njit
+def total(x):
+    s = 0.0
+    for v in x:
+        s += v * v
+    return s
+x = np.arange(1000.0)
+before = total(x)
+full = resident()
+given = give_back_code()
+left = resident()
+matrix = np.random.default_rng(1).random((200, 200))
+assert total(x) == before
+assert np.allclose(np.linalg.inv(matrix) @ matrix, np.eye(200))
+@numba.njit
+def again(x):  # the compiler still works, too
+    return x.sum() + 1.0
+assert again(x) == x.sum() + 1.0
+assert give_back_code(1 << 60) == 0
+print(given, full - left)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells its mappings")
+def test_the_compiler_is_given_back_and_everything_goes_on() -> None:
+    ran = subprocess.run([sys.executable, "-c", _TRY], capture_output=True, text=True, timeout=120, check=True)
+    given, less = map(int, ran.stdout.split())
+    assert given > 20e6
+    assert less > 0.7 * given
+
+
+def test_only_unwritten_code_of_files_is_looked_at() -> None:
+    lines = [
+        "00400000-00500000 r-xp 00000000 08:01 42 /usr/lib/libx y.so",
+        "Rss:                 512 kB",
+        "Private_Dirty:         0 kB",
+        "VmFlags: rd ex mr mw me",
+        "00500000-00600000 rw-p 00000000 08:01 42 /usr/lib/libx y.so",
+        "Rss:                 100 kB",
+        "00600000-00700000 r-xp 00000000 00:00 0 [vdso]",
+        "Rss:                   4 kB",
+        "00700000-00800000 r-xp 00000000 00:00 0",
+        "Rss:                   8 kB",
+    ]
+    assert _code_of_files(lines) == [(0x400000, 0x500000, {"Rss": 512, "Private_Dirty": 0})]
