@@ -1,4 +1,4 @@
-"""Sends outputs over Zenoh: newest wins, nothing blocks, every loss is counted; answers plain get() and calls.
+"""Sends outputs over Zenoh: newest wins (of readings the newest eight), losses are counted; answers get() and calls.
 
 fusion --send---------------------------------> publishers            (sector maps: nothing may delay them)
        --offer--> outbox --> stream thread --> publishers            (scans, poses, ranges, health)
@@ -33,6 +33,7 @@ from service.outputs import (
     Output,
     PolarOut,
     PoseOut,
+    RangesOut,
     RectOut,
     ScanOut,
 )
@@ -44,6 +45,7 @@ from service.zenoh_session import NetworkSettings
 
 _LOG = logging.getLogger(__name__)
 _UPDATES_WAITING_MAX = 64
+_READINGS_WAITING_MAX = 8
 _QUERIES_WAITING_MAX = 64
 
 Parcel = Callable[[], list[Message]]
@@ -216,6 +218,8 @@ class Publisher:
                 pass  # for the makers of maps only
             case GridUpdateOut():
                 self._outboxes[Lane.MAP].put(slot, parcel, depth=_UPDATES_WAITING_MAX, wake=wake)
+            case ScanOut() | OdomOut() | RangesOut():  # as measured: what comes in bursts is sent one after the other
+                self._outboxes[Lane.STREAM].put(slot, parcel, depth=_READINGS_WAITING_MAX, wake=wake)
             case _:
                 self._outboxes[Lane.STREAM].put(slot, parcel, wake=wake)
 

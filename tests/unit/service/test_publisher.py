@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
+from service.clock import CrankedClock
 from service.errors import Trouble
 from service.outputs import GridOut, GridUpdateOut, HealthOut, OdomOut, Output, PoseOut, RangesOut, ScanOut
 from service.payloads import Message
-from service.publisher import Outbox, Parcel, slot_of
+from service.publisher import Outbox, Parcel, Publisher, slot_of
 from service.rpc import CallRefused, Calls, map_name
-from service.zenoh_session import is_loopback, refuse_open_listeners
+from service.zenoh_session import NetworkSettings, is_loopback, refuse_open_listeners
 
 
 def parcel(number: int) -> Parcel:
@@ -291,3 +292,16 @@ def test_good_names_of_maps() -> None:
     assert map_name({"name": "Floor-1_east"}) == "Floor-1_east"
     with pytest.raises(CallRefused):
         map_name({})
+
+
+def test_readings_of_a_burst_are_all_sent_and_poses_only_the_newest() -> None:
+    publisher = Publisher("robots/r1", NetworkSettings(), clock=CrankedClock(0, 0))
+    for k in range(5):
+        publisher.offer(RangesOut("left", k, (Pose2(),), 0.5, 0.1, 5.0, (1.0,)), wake=False)
+        publisher.offer(OdomOut(k, Pose2(), np.eye(3), 0.0, 0.0), wake=False)
+        publisher.offer(PoseOut(k, Pose2(), Pose2(), np.eye(3)), wake=False)
+    lost = {name: count for name, count in publisher.counters().items() if name.startswith("not_sent.")}
+    assert lost == {"not_sent.pose": 4}
+    for k in range(20):
+        publisher.offer(RangesOut("left", 5 + k, (Pose2(),), 0.5, 0.1, 5.0, (1.0,)), wake=False)
+    assert publisher.counters()["not_sent.range/left"] == 25 - 8
