@@ -67,6 +67,7 @@ _WIRE_STOP_S = 1.5
 _FUSION_STOP_S = 2.0
 _PUBLISHER_STOP_S = 2.0
 _MAVLINK_STOP_S = 1.0
+_GIVE_BACK_AT_S = (1, 6)  # the makers of maps load theirs with the first sweeps
 _GIL_SWITCH_S = 0.001  # a scan passes through three threads; by default each may wait 5 ms for the one that computes
 
 
@@ -103,13 +104,16 @@ class Daemon:
                 return 0
             gc.collect()
             gc.freeze()  # modules and kernels stay: looking through them again would hold every thread for 50 ms
-            log.debug("%.0f MB of code that only starting needed were given back", give_back_code() / 1e6)
             try:
                 self._notifier.ready(self._summary())
                 log.info("%s", self._summary())
                 end_ns = self._clock.now_ns() + round(seconds * 1e9)
+                turns = 0
                 while not asked.wait(1.0) and not (seconds and self._clock.now_ns() >= end_ns):
                     self._notifier.status(self._summary())
+                    turns += 1
+                    if turns in _GIVE_BACK_AT_S:
+                        log.debug("%.0f MB of code that only starting needed given back", give_back_code() / 1e6)
             finally:
                 log.info("stopping: closing ports, saving the map")
                 self._notifier.stopping("closing ports and saving the map")

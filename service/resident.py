@@ -10,7 +10,7 @@ import ctypes
 import re
 from pathlib import Path
 
-_LEAST_BYTES = 4 << 20
+_LEAST_BYTES = 1 << 20
 _MADV_DONTNEED = 4
 _RANGE = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (\S{4}) \S+ \S+ \d+ +(/.*)$")
 
