@@ -43,6 +43,7 @@ _LOG = logging.getLogger(__name__)
 
 _POLL_S = 0.2
 _COMPILERS = 2
+_FOR_LOGS = ("footprint", "lines", "slam", "grids")
 Step = Callable[[], None]
 Meanwhile = Callable[[str], None]
 
@@ -57,7 +58,18 @@ def warm_up(config: Config, *, stop_asked: Callable[[], bool] = bool, meanwhile:
     meanwhile: called every fifth of a second while others compile, with what is going on.
     Raises StoppedWhileCompiling soon after stop_asked() is true.
     """
-    steps, asked_others = _steps(config), False
+    _warm(config, _steps(config), stop_asked, meanwhile)
+
+
+def warm_up_for_logs(meanwhile: Meanwhile | None = None) -> None:
+    """Load or compile what SLAM, grid and lines of a recorded log use, so that a first run is as fast as others."""
+    config = Config.model_validate({"lasers": {"front": {"driver": "hokuyo", "port": "/dev/null"}}})
+    steps = {name: step for name, step in _steps(config).items() if name in _FOR_LOGS}
+    _warm(config, steps, bool, meanwhile)
+
+
+def _warm(config: Config, steps: dict[str, Step], stop_asked: Callable[[], bool], meanwhile: Meanwhile | None) -> None:
+    asked_others = False
     for count, step in enumerate(list(steps.values()), start=1):
         with _compilations() as compiled:
             step()

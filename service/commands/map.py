@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -290,8 +291,11 @@ def build(
     from rich.progress import Progress
 
     from service import map_build
+    from service.warm_up import warm_up_for_logs
 
     console = Console(stderr=True)
+    with console.status("compiling the kernels, if they have changed") if console.is_terminal else nullcontext():
+        warm_up_for_logs()
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(log.name, total=None)
         built = map_build.build(

@@ -49,3 +49,16 @@ def test_compiling_ends_when_stopping_is_asked_for(tmp_path: Path) -> None:
     outcome, log = _warm_up(tmp_path, stop=True)
     assert outcome == "stopped"
     assert "kernels compiled" not in log
+
+
+def test_what_logs_need_is_known_by_name_and_ready_afterwards() -> None:
+    """In a process of its own."""
+    script = """
+from service import warm_up
+warm_up.warm_up_for_logs()
+with warm_up._compilations() as compiled:
+    warm_up.warm_up_for_logs()
+print(len(compiled))
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=240, check=True)
+    assert ran.stdout.strip() == "0"
