@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from enum import StrEnum
@@ -291,11 +293,10 @@ def build(
     from rich.progress import Progress
 
     from service import map_build
-    from service.warm_up import warm_up_for_logs
 
     console = Console(stderr=True)
     with console.status("compiling the kernels, if they have changed") if console.is_terminal else nullcontext():
-        warm_up_for_logs()
+        subprocess.run([sys.executable, "-m", "service.warm_up", "logs"], check=False)  # in here it would stay: 80 MB
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(log.name, total=None)
         built = map_build.build(
