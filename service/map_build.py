@@ -38,7 +38,6 @@ from service.log_lines import line_map_of
 from service.map_export import LINES, lines_layer
 from service.map_import import write_grid_map
 from service.recording_log import read_any_log
-from service.resident import give_back_code
 
 F64 = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -46,7 +45,6 @@ Progress = Callable[[int, int], None]
 OCCUPIED_FROM_PERCENT = 65  # as map servers read a map: occupied_thresh 0.65
 NEAR_M = 0.10
 BEFORE_END_M = 0.20
-_GIVE_BACK_AT = 1024
 APART_M, APART_RAD = 0.2, math.radians(10.0)  # of scans that add lines: more of them add little
 
 
@@ -112,13 +110,7 @@ def build(
     if poses is PoseSource.SLAM:
         from service.slam_log import run_slam
 
-        def on_way(done: int, total: int) -> None:
-            if done == _GIVE_BACK_AT:  # all kernels are loaded
-                give_back_code()
-            if progress is not None:
-                progress(done, total)
-
-        run = run_slam(log, scans, progress=on_way)
+        run = run_slam(log, scans, progress=progress)
         robot_poses, slam = run.robot_poses, run.figures
     else:
         robot_poses = poses_from_log(log, scans, poses)
