@@ -61,11 +61,11 @@ def warm_up(config: Config, *, stop_asked: Callable[[], bool] = bool, meanwhile:
     _warm(config, _steps(config), stop_asked, meanwhile)
 
 
-def warm_up_for_logs(meanwhile: Meanwhile | None = None) -> None:
+def warm_up_for_logs() -> None:
     """Load or compile what SLAM, grid and lines of a recorded log use, so that a first run is as fast as others."""
     config = Config.model_validate({"lasers": {"front": {"driver": "hokuyo", "port": "/dev/null"}}})
     steps = {name: step for name, step in _steps(config).items() if name in _FOR_LOGS}
-    _warm(config, steps, bool, meanwhile)
+    _warm(config, steps, bool, None)
 
 
 def _warm(config: Config, steps: dict[str, Step], stop_asked: Callable[[], bool], meanwhile: Meanwhile | None) -> None:

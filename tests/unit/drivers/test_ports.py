@@ -519,7 +519,7 @@ class FakeBus:
             raise self.send_error
 
     def fileno(self) -> int:
-        raise NotImplementedError
+        raise NotImplementedError  # as python-can's buses do that have none
 
     def shutdown(self) -> None:
         raise OSError("already gone")
