@@ -104,10 +104,11 @@ class Metered(SlamLocaliser):
 
     spent_ns = 0
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
         began = time.thread_time_ns()
-        super().take_scan(sensor, scan, odom_from_base, base_from_sensor)
+        fits = super().take_scan(sensor, scan, odom_from_base, base_from_sensor)
         self.spent_ns += time.thread_time_ns() - began
+        return fits
 
 
 def measure(seconds: float) -> dict[str, float]:

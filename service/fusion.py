@@ -181,12 +181,12 @@ class Localiser(Protocol):
     def take_odometry(self, state: OdometryState) -> None:
         """Each new state, in order."""
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
-        """Each sweep that odometry covers, in order of stamps, before it is put into the grids. odom_from_base: None on
-        a robot without odometry, whose odom frame is then its base."""
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
+        """Each sweep that odometry covers, in order of stamps, before it is put into the grids: whether it may be.
+        odom_from_base: None on a robot without odometry, whose odom frame is then its base."""
 
-    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> None:
-        """Each round of sonars, and each touch, that is put into the grids."""
+    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> bool:
+        """Each round of sonars, and each touch, before it is put into the grids: whether it may be."""
 
     def map_from_odom(self) -> Pose2:
         """The correction as of now."""
@@ -228,11 +228,11 @@ class OdometryOnly:
     def take_odometry(self, state: OdometryState) -> None:
         """Nothing to learn from it."""
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
-        """Nothing to learn from it."""
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
+        return True
 
-    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> None:
-        """Nothing to learn from it."""
+    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> bool:
+        return True
 
     def map_from_odom(self) -> Pose2:
         return self._map_from_odom
@@ -727,12 +727,13 @@ class Fusion:
         localiser = self._parts.localiser
         if isinstance(value, Round | Touch):
             odom_from_base = self._poses.at(value.stamp_ns)
-            localiser.take_round(source, value, odom_from_base)
-            self._insert_round(source, value, localiser.map_from_odom() @ odom_from_base)
+            if localiser.take_round(source, value, odom_from_base):
+                self._insert_round(source, value, localiser.map_from_odom() @ odom_from_base)
             return
         base_from_sensor = self._laser(source).base_from_sensor
         odom_from_bases = self._poses.at_many(beam_stamps(value))
-        localiser.take_scan(source, value, self._poses, base_from_sensor)
+        if not localiser.take_scan(source, value, self._poses, base_from_sensor):
+            return
         map_from_base = compose_many(localiser.map_from_odom(), odom_from_bases)
         self._insert_sweep(source, value, carry(map_from_base, base_from_sensor))
 
@@ -740,11 +741,12 @@ class Fusion:
         """Without odometry: where the localiser has it, by scans alone."""
         localiser = self._parts.localiser
         if isinstance(value, Round | Touch):
-            localiser.take_round(source, value, IDENTITY)
-            self._insert_round(source, value, localiser.map_from_odom())
+            if localiser.take_round(source, value, IDENTITY):
+                self._insert_round(source, value, localiser.map_from_odom())
             return
         base_from_sensor = self._laser(source).base_from_sensor
-        localiser.take_scan(source, value, None, base_from_sensor)
+        if not localiser.take_scan(source, value, None, base_from_sensor):
+            return
         pose = localiser.map_from_odom() @ base_from_sensor
         self._insert_sweep(source, value, np.array([pose.x_m, pose.y_m, pose.yaw_rad]))
 

@@ -58,19 +58,19 @@ class LineLocaliser(OdometryOnly):
     def take_odometry(self, state: OdometryState) -> None:
         self._is_broken |= state.broken
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
         if sensor not in self._sources or odom_from_base is None:
-            return
+            return True
         stamps = beam_stamps(scan)
         odom = odom_from_base.at(int(stamps[len(stamps) // 2]))
         if self._matched_ns is not None and scan.stamp_ns <= self._matched_ns:
             self._counts["slam.scans_unordered"] += 1
-            return
+            return True
         if self._ekf is None:
             self._ekf = LineEkf(self._map_from_odom @ odom, rules=self._rules)
         elif not self._is_due(scan.stamp_ns, odom):
             self._counts["slam.scans_passed"] += 1
-            return
+            return True
         else:
             self._ekf.predict(*self._step(odom))
         self._odom, self._matched_ns, self._is_broken = odom, scan.stamp_ns, False
@@ -78,6 +78,7 @@ class LineLocaliser(OdometryOnly):
         self._unmatched = 0 if seen.matched else self._unmatched + 1
         self._map_from_odom = self._ekf.pose @ odom.inverse()
         self._counts["slam.scans"] += 1
+        return True
 
     def locate(self, state: OdometryState) -> Located:
         if self._ekf is None:

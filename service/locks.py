@@ -44,6 +44,10 @@ class Claims:
             "path in [store]",
         )
 
+    def claim_endpoint(self, endpoint: str) -> None:
+        """Take a Zenoh endpoint for a daemon that is about to be started."""
+        self._claim("endpoint", endpoint, f"{endpoint} is taken by process {{pid}}")
+
     def _claim(self, kind: str, name: str, refusal: str) -> None:
         holder = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         address = "\0umfeld/" + kind + "/" + hashlib.sha256(name.encode()).hexdigest()[:32]

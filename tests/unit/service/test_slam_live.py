@@ -11,10 +11,11 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.pose_buffer import PoseBuffer
 from mapping.scan import Scan
 from service import assemble
 from service.background import Submit, at_once
-from service.fusion import OdometryOnly
+from service.fusion import Cone, OdometryOnly, Round
 from service.redraw import Redrawer
 from service.rpc import CallRefused, Calls
 from service.slam_live import SlamLocaliser
@@ -157,3 +158,69 @@ def test_the_calls_are_there_with_slam_alone_and_answer_in_json(driver: Driver) 
     assert [each["number"] for each in answer["undone"]] == [2]
     assert len(json.loads(calls._call("list_closures", b""))["closures"]) == 2
     assert list(assemble.closure_calls(OdometryOnly(Pose2(0.0, 0.0, 0.0)), lambda work: work())) == []
+
+
+# --- what is not drawn
+
+
+class Wheels:
+    """A robot whose odometry is told apart from where it is; a scan every 50 ms."""
+
+    def __init__(self) -> None:
+        self.localiser = SlamLocaliser(["front"], submit=at_once)
+        self.odometry = PoseBuffer()
+        self.stamp_ns = 0
+
+    def look(self, truth: Pose2, odom: Pose2, ranges: F64 | None = None) -> bool:
+        """Whether it is drawn."""
+        self.stamp_ns += 50 * MS
+        self.odometry.add(self.stamp_ns, odom)
+        seen = seen_from(truth) if ranges is None else ranges
+        scan = Scan(self.stamp_ns, 0.0, BEARING, seen, 0.05, 20.0)
+        return self.localiser.take_scan("front", scan, self.odometry, Pose2())
+
+    def place(self, odom: Pose2) -> Pose2:
+        return self.localiser.map_from_odom() @ odom
+
+
+@pytest.mark.parametrize(("way_m", "turn_rad"), [(0.0, 0.06), (0.0, -0.06), (0.08, 0.02)])
+def test_wheels_that_tell_nothing_are_not_believed_for_long(way_m: float, turn_rad: float) -> None:
+    """Carried or slipping: where a scan is drawn is never off by more than is seen, though odometry stands still."""
+    robot, still = Wheels(), Pose2()
+    truth = Pose2(0.3, -0.4, 0.0)
+    for _ in range(3):
+        robot.look(truth, still)
+    start = robot.place(still)
+    for step in range(1, 16):
+        moved = Pose2(way_m * step, 0.0, turn_rad * step)
+        assert robot.look(truth @ moved, still)
+        off = (start @ moved).inverse() @ robot.place(still)
+        assert math.hypot(off.x_m, off.y_m) < 0.2
+        assert abs(off.yaw_rad) < 0.11
+    assert robot.localiser.counters()["slam.scans_elsewhere"] > 3
+
+
+def test_where_odometry_is_right_hardly_a_scan_is_matched_twice() -> None:
+    robot = Wheels()
+    rng = np.random.default_rng(3)
+    for step in range(80):
+        at = Pose2(-1.5 + 0.03 * step, -0.5, 0.3 * math.sin(0.1 * step))
+        noise = rng.normal(0.0, 0.02, len(BEARING))
+        assert robot.look(at, at, seen_from(at) + noise)
+    assert robot.localiser.counters()["slam.scans_elsewhere"] == 0
+
+
+def test_what_fits_nothing_is_not_drawn_until_something_fits_again() -> None:
+    robot, here = Wheels(), Pose2(0.3, -0.4, 0.0)
+    for _ in range(3):
+        assert robot.look(here, here)
+    clutter = np.random.default_rng(5).uniform(0.4, 0.6, len(BEARING))  # a cloth over the lens
+    round_ = Round(robot.stamp_ns, (Cone(0, Pose2(), 1.0),), 0.5, 0.1, 3.0)
+    for _ in range(30):
+        assert not robot.look(here, here, clutter)
+        assert not robot.localiser.take_round("sonars", round_, here)
+    counts = robot.localiser.counters()
+    assert counts["slam.scans_not_drawn"] == counts["slam.rounds_not_drawn"] == 30
+    assert any("nothing is drawn" in trouble for trouble in robot.localiser.troubles()) or counts["slam.scans"] < 25
+    assert robot.look(here, here)
+    assert robot.localiser.take_round("sonars", round_, here)
