@@ -363,16 +363,34 @@ def _pdo_id(communication: int) -> Steps:
     return cob_id & 0x7FF if 0x180 < cob_id & 0x7FF < 0x580 else 0
 
 
+def _map_position(number: int, cob_id: int) -> Steps:
+    """TPDO `number` has the position and nothing else. Returns its COB-ID as it is now: switched off, if it was mapped.
+
+    What is so already is not written, since some nodes store each write; a node that does not tell has it fixed.
+    """
+    communication, mapping = 0x1800 + number, 0x1A00 + number
+    count = yield Upload(mapping, 0)
+    first = yield Upload(mapping, 1)
+    if not count.ok and not first.ok:
+        return cob_id
+    if first.ok and first.number == _POSITION_MAPPING and (not count.ok or count.number == 1):
+        return cob_id
+    yield Download(communication, 1, (cob_id | _PDO_DISABLED).to_bytes(4, "little"))
+    yield Download(mapping, 0, b"\0")
+    yield Download(mapping, 1, _POSITION_MAPPING.to_bytes(4, "little"))
+    yield Download(mapping, 0, b"\1")
+    return cob_id | _PDO_DISABLED
+
+
+def _switch_on(communication: int, cob_id: int) -> Generator[Upload | Download, SdoDone, None]:
+    if cob_id & _PDO_DISABLED:
+        yield Download(communication, 1, (cob_id & ~_PDO_DISABLED).to_bytes(4, "little"))
+
+
 def _send_on_sync() -> Generator[Upload | Download, SdoDone, None]:
-    """TPDO2: the position, after each SYNC. Writes only what is not so already: some nodes store each write."""
+    """TPDO2: the position, after each SYNC."""
     cob_id = yield from _number(Upload(0x1801, 1))
-    mapped = yield from _number(Upload(0x1A01, 1))
-    if mapped not in (0, _POSITION_MAPPING):
-        yield Download(0x1801, 1, (cob_id | _PDO_DISABLED).to_bytes(4, "little"))
-        yield Download(0x1A01, 0, b"\0")
-        yield Download(0x1A01, 1, _POSITION_MAPPING.to_bytes(4, "little"))
-        yield Download(0x1A01, 0, b"\1")
-        cob_id |= _PDO_DISABLED
+    cob_id = yield from _map_position(1, cob_id)
     kind = yield from _number(Upload(0x1801, 2))
     if kind != 1:
         done = yield Download(0x1801, 2, b"\1")
@@ -380,18 +398,20 @@ def _send_on_sync() -> Generator[Upload | Download, SdoDone, None]:
             yield Download(0x1801, 1, (cob_id | _PDO_DISABLED).to_bytes(4, "little"))
             cob_id |= _PDO_DISABLED
             yield Download(0x1801, 2, b"\1")
-    if cob_id & _PDO_DISABLED:
-        yield Download(0x1801, 1, (cob_id & ~_PDO_DISABLED).to_bytes(4, "little"))
+    yield from _switch_on(0x1801, cob_id)
 
 
 def _send_by_timer(period_ms: int) -> Generator[Upload | Download, SdoDone, None]:
     """TPDO1: the position, every period_ms. 6200h and 1800h:05 are the same timer; one of the two is enough."""
+    cob_id = yield from _number(Upload(0x1800, 1))
+    cob_id = yield from _map_position(0, cob_id)
     timer = period_ms.to_bytes(2, "little")
     yield Download(0x1800, 2, b"\xfe")
     first = yield Download(0x1800, 5, timer)
     second = yield Download(0x6200, 0, timer)
     if not first.ok and not second.ok:
         raise _Refused("it takes no timer (1800h:05, 6200h) for its position: set one with the maker's tool")
+    yield from _switch_on(0x1800, cob_id)
 
 
 # ---- the pair

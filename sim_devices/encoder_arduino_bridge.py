@@ -10,7 +10,8 @@ Source: the sketch and its Python driver (hbrobotics/ros_arduino_bridge), exchan
 Habits kept: characters before the first blank overwrite the letter, so line feeds before it do no harm; LF ends
 nothing; the counts are signed 32 bits; the wheels stop by themselves 2 s after the last `m`. A ping blocks the board as
 long as its echo is under way, and for a second if nothing is connected to the pin. The board is deaf while it starts;
-characters that come then are lost. Arguments read as C's atoi reads them.
+characters that come then are lost. Arguments read as C's atoi reads them. The board's USB chip hands on a reply in one
+packet: drivers that stop reading at CR and empty the port before they ask again rely on its LF being there by then.
 
 Assumed: a ping without echo answers 0 after 38 ms; a pin nobody connected reads 1 where the sketch pulled it up
 (`c pin 2`, or 1 written to an input) and 0 else; an unconnected analog input reads 0. Opening the port resets a real
@@ -174,7 +175,7 @@ class ArduinoBridge:
             if character == 0x0D:
                 reply, busy_ns = self._run(now_ns)
                 self._free_ns = now_ns + busy_ns
-                self._wire.send(reply + b"\r\n", self._free_ns + TURN_AROUND_NS)
+                self._wire.send(reply + b"\r\n", self._free_ns + TURN_AROUND_NS, whole=True)
                 self._letter, self._arguments, self._filling = 0, [bytearray(), bytearray()], 0
             elif character == 0x20:
                 self._filling = min(2, self._filling + 1)

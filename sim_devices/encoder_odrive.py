@@ -12,7 +12,8 @@ trajectory done; 0.6.x: procedure result, trajectory done, 0.
 
 Habits kept: velocity moves the wheel in closed loop only; a calibration takes seconds and ends in idle; positions are
 32-bit floats, so their steps grow with the way; the estimates start at 0 with every start and reboot (incremental
-encoder); an error disarms. Commands longer than needed are taken, shorter ones are not.
+encoder); an error disarms. Commands longer than needed are taken; of shorter ones the missing bytes count as 0 (hosts
+in use send the axis state as one byte).
 
 Assumed: torque mode moves nothing; a target position is reached at the velocity limit; closed loop is entered without a
 calibration before, as a board with stored calibration does; 0.6.x sends what `cyclic_ms` names besides.
@@ -267,7 +268,8 @@ class ODriveAxis:
             tail = (motor, encoder, controller | (0x80 if self.trajectory_done else 0))
         return struct.pack("<IB3B", self.error, self.state, *tail)
 
-    def _obey(self, command: int, data: bytes, now_ns: int) -> None:
+    def _obey(self, command: int, told: bytes, now_ns: int) -> None:
+        data = told.ljust(8, b"\0") if told else b""
         if command == ESTOP:
             self._fail(ESTOP_REQUESTED, now_ns)
         elif command == REBOOT:
@@ -281,10 +283,10 @@ class ODriveAxis:
         elif command == LIMITS and len(data) >= 4:
             self._velocity_limit = abs(struct.unpack("<f", data[:4])[0])
         elif command == ADDRESS and data:
-            self._take_address(data)
+            self._take_address(told)
         elif command == SET_POSITION and len(data) >= 4:
-            told = struct.unpack("<f" if self.is_new else "<i", data[:4])[0]
-            self._zero_turns = self._raw_turns(now_ns) - (told if self.is_new else told / self.cpr)
+            place = struct.unpack("<f" if self.is_new else "<i", data[:4])[0]
+            self._zero_turns = self._raw_turns(now_ns) - (place if self.is_new else place / self.cpr)
         elif command in (POS, VEL) and len(data) >= 4 and self.state == CLOSED_LOOP:
             self._move(command, struct.unpack("<f", data[:4])[0], now_ns)
 

@@ -35,11 +35,14 @@ UNDERFLOW, BACKWARD, OVERFLOW = 0x01, 0x02, 0x04
 ACKNOWLEDGED = b"\xff"
 BUFFER_EMPTY = 0x80
 
+LEAST_BY_BYTE, MOST_BY_BYTE = (2, 26), (3, 27)  # limits of batteries: (V - 6) * 5, V * 5.12
+WIDE_PINS = "5B"  # 74 and 75 of newer firmware: CTRL1 and CTRL2 as well
+
 # What is only kept: command that writes -> (format, command that reads back, place in what that one returns).
 SETTINGS: dict[int, tuple[str, int, int]] = {
-    14: ("B", 15, 0), 28: ("IIII", 55, 0), 29: ("IIII", 56, 0), 57: ("HHB", 59, 0), 58: ("HH", 60, 0),
+    2: ("B", 59, 0), 3: ("B", 59, 1), 14: ("B", 15, 0), 26: ("B", 60, 0), 27: ("B", 60, 1), 28: ("IIII", 55, 0), 29: ("IIII", 56, 0), 57: ("HHB", 59, 0), 58: ("HH", 60, 0),
     61: ("7I", 63, 0), 62: ("7I", 64, 0), 68: ("II", 81, 0), 69: ("II", 81, 2), 70: ("H", 72, 0), 71: ("H", 72, 1),
-    74: ("5B", 75, 0), 76: ("BBHHHHHBBHHHHH", 77, 0), 92: ("B", 91, 0), 93: ("B", 91, 1), 98: ("H", 99, 0),
+    74: ("BBB", 75, 0), 76: ("BBHHHHHBBHHHHH", 77, 0), 92: ("B", 91, 0), 93: ("B", 91, 1), 98: ("H", 99, 0),
     105: ("I", 107, 0), 106: ("I", 107, 1), 109: ("HH", 110, 0), 112: ("HH", 113, 0), 115: ("BB", 116, 0),
     128: ("II", 130, 0), 129: ("II", 131, 0), 133: ("II", 135, 0), 134: ("II", 136, 0), 139: ("BBB", 140, 0),
     148: ("BB", 149, 0), 160: ("BB", 161, 0), 201: ("B", 202, 0),
@@ -47,10 +50,16 @@ SETTINGS: dict[int, tuple[str, int, int]] = {
 DEFAULTS: dict[int, tuple[str, list[int]]] = {
     15: ("B", [0]), 55: ("IIII", [0, 65536, 32768, 44000]), 56: ("IIII", [0, 65536, 32768, 44000]),
     59: ("HHB", [60, 340, 0]), 60: ("HH", [60, 340]), 63: ("7I", [0] * 7), 64: ("7I", [0] * 7),
-    72: ("HH", [32767, 32767]), 75: ("5B", [0] * 5), 77: ("BBHHHHHBBHHHHH", [0] * 14), 81: ("4I", [0] * 4),
+    72: ("HH", [32767, 32767]), 75: ("BBB", [0] * 3), 77: ("BBHHHHHBBHHHHH", [0] * 14), 81: ("4I", [0] * 4),
     91: ("BB", [0, 0]), 99: ("H", [3]), 107: ("II", [0, 0]), 110: ("HH", [0, 0]), 113: ("HH", [0, 0]),
     116: ("BB", [0, 0]), 130: ("II", [0, 0]), 131: ("II", [0, 0]), 135: ("II", [1000, 0]), 136: ("II", [1000, 0]),
     140: ("BBB", [0, 1, 2]), 149: ("BB", [0, 0]), 161: ("BB", [0, 0]), 202: ("B", [0]),
+}  # fmt: skip
+
+# Both motors by one 7-bit number, as "mixed": way ahead and turn, each kept until the next; sign, and whether about 64.
+MIXED: dict[int, tuple[str, int, int]] = {
+    8: ("ahead", 1, 0), 9: ("ahead", -1, 0), 10: ("turn", 1, 0), 11: ("turn", -1, 0), 12: ("ahead", 1, 64),
+    13: ("turn", 1, 64),
 }  # fmt: skip
 
 # Commands that move motors: which motors, and what each argument is: s speed, d duty, w way, t target position,
@@ -108,7 +117,8 @@ class RoboClaw:
 
     m1, m2: left and right wheel as wired.  link: "usb" takes any line speed, "ttl" only baud_bps.
     main_v, logic_v: its batteries.  top_ticks_per_s: speed at 100 % duty.  wide_status: command 90 answers 32 bits (new
-    firmware) or 16.  packet_gap_ns: pause that ends a packet.
+    firmware) or 16.  wide_pins: 74 and 75 have five pins' modes (newer firmware) or three.  packet_gap_ns: pause that
+    ends a packet.
     """
 
     fault_family = "encoder"
@@ -126,6 +136,7 @@ class RoboClaw:
         logic_v: float = 5.0,
         top_ticks_per_s: float = 44000.0,
         wide_status: bool = True,
+        wide_pins: bool = False,
         packet_gap_ns: int = PACKET_GAP_NS,
     ) -> None:
         if address not in ADDRESSES:
@@ -142,6 +153,7 @@ class RoboClaw:
         self._version = version.encode("ascii") + b"\0"
         self._top = top_ticks_per_s
         self._wide_status = wide_status
+        self._wide_pins = wide_pins
         self._gap_ns = packet_gap_ns
         self._wire = PacedWire(baud_bps if link == "ttl" else 2_000_000)
         self._powered = False
@@ -199,8 +211,14 @@ class RoboClaw:
         self._lost = False  # the rest of a packet nobody knows is thrown away
         self._heard_ns: int = now_ns
         self._valid_ns: int = now_ns
-        self._values = {command: (form, list(values)) for command, (form, values) in DEFAULTS.items()}
+        self._restore()
+        self._mixed = {"ahead": 0.0, "turn": 0.0}
         self._wire.clear(now_ns)
+
+    def _restore(self) -> None:
+        self._values = {command: (form, list(values)) for command, (form, values) in DEFAULTS.items()}
+        if self._wide_pins:
+            self._values[75] = (WIDE_PINS, [0] * 5)
 
     @property
     def _timeout_ns(self) -> int:
@@ -244,10 +262,14 @@ class RoboClaw:
         """The data that follow a command, as a struct format; None if nobody knows it."""
         if command in READS or command in self._values:
             return ""
+        if command == 74 and self._wide_pins:
+            return WIDE_PINS
         if command in SETTINGS:
             return SETTINGS[command][0]
         if command in MOVES:
             return MOVES[command][1]
+        if command in MIXED:
+            return "B"
         return PLAIN_WRITES.get(command)
 
     def _obey(self, packet: bytes, form: str, now_ns: int) -> None:
@@ -328,16 +350,22 @@ class RoboClaw:
     def _write(self, command: int, values: list[int], now_ns: int) -> None:
         if command in SETTINGS:
             _, read, place = SETTINGS[command]
+            if command in LEAST_BY_BYTE:
+                values = [60 + 2 * values[0]]
+            elif command in MOST_BY_BYTE:
+                values = [round(values[0] / 0.512)]
             self._values[read][1][place : place + len(values)] = values
         elif command in MOVES:
             self._move(command, values, now_ns)
+        elif command in MIXED:
+            self._mix(command, values[0], now_ns)
         elif command == 20:
             for motor in self.motors:
                 motor.set_count(0, now_ns)
         elif command in (22, 23):
             self.motors[command - 22].set_count(values[0], now_ns)
         elif command == 80:
-            self._values = {number: (form, list(kept)) for number, (form, kept) in DEFAULTS.items()}
+            self._restore()
 
     def _move(self, command: int, values: list[int], now_ns: int) -> None:
         """Deal the arguments out to the motors: each letter that occurs twice goes to one motor after the other."""
@@ -348,6 +376,13 @@ class RoboClaw:
         for place, name in enumerate(which):
             told = {letter: given[min(place, len(given) - 1)] for letter, given in dealt.items()}
             self._move_one(self.motors[int(name) - 1], told, now_ns)
+
+    def _mix(self, command: int, value: int, now_ns: int) -> None:
+        what, sign, middle = MIXED[command]
+        self._mixed[what] = sign * (min(127, value) - middle) / (127.0 - middle)
+        ahead, turn = self._mixed["ahead"], self._mixed["turn"]
+        for motor, share in zip(self.motors, (ahead + turn, ahead - turn)):
+            self._turn(motor, max(-1.0, min(1.0, share)) * self._top, now_ns)
 
     def _move_one(self, motor: _Motor, told: Mapping[str, int], now_ns: int) -> None:
         if "d" in told:

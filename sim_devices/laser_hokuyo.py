@@ -485,7 +485,8 @@ class HokuyoLaser:
             self._wire.send(line + b"\nE\n\n", now_ns)
 
     def _answer(self, echo: bytes, status: str, now_ns: int, lines: bytes = b"") -> None:
-        self._wire.send(echo + b"\n" + sealed(status.encode("ascii")) + lines + b"\n", now_ns)
+        reply = echo + b"\n" + sealed(status.encode("ascii")) + lines + b"\n"
+        self._wire.send(reply, now_ns, whole=self.link == "tcp")  # TCP is given whole replies
 
     def _sized(self, command: bytes, free: bytes, length: int, now_ns: int) -> bool:
         """Whether a command is as long as it must be; refuses it otherwise."""

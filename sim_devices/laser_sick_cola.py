@@ -18,6 +18,7 @@ What this emulator does that a naive one would not:
 - Scans have the channels, the range of angles and the rate that were configured; a device in trouble says so in the
   status words of every scan, and has no distances.
 - Its 48 monitoring fields are empty and its digital lines rest, so their events never come.
+- A telegram is handed to TCP in one piece, as scanners do: hosts that read once for each question rely on that.
 - Not yet up to speed: device state busy, no scans. A host that goes away ends its events and its user level.
 - Assumed: the time since start-up in a scan is that of its first beam; distances of 0 mean no echo, 1 blinded, 2 too
   close; real units take only the dialect they are set to.
@@ -333,11 +334,11 @@ class SickColaLaser:
         head = f"{command} {request.name}".encode("ascii")
         body = encode_fields(fields, binary=request.binary)
         gap = b" " if body or request.binary else b""
-        self._wire.send(frame(head + gap + body, binary=request.binary), now_ns + REPLY_NS)
+        self._wire.send(frame(head + gap + body, binary=request.binary), now_ns + REPLY_NS, whole=True)
 
     def _refuse(self, request: _Request, code: int, now_ns: int) -> None:
         body = b"sFA " + encode_fields([("B", code)], binary=request.binary)
-        self._wire.send(frame(body, binary=request.binary), now_ns + REPLY_NS)
+        self._wire.send(frame(body, binary=request.binary), now_ns + REPLY_NS, whole=True)
 
     def _obey(self, request: _Request, now_ns: int) -> None:
         match request.command:
@@ -365,7 +366,7 @@ class SickColaLaser:
         written = self._variables.get((request.name, request.binary))
         if written is not None:
             body = f"sRA {request.name} ".encode("ascii") + written
-            self._wire.send(frame(body, binary=request.binary), now_ns + REPLY_NS)
+            self._wire.send(frame(body, binary=request.binary), now_ns + REPLY_NS, whole=True)
             return
         fields = self._variable(request.name, now_ns)
         if fields is None:
@@ -560,7 +561,7 @@ class SickColaLaser:
                 self.skipped_scans += 1
                 continue
             body = encode_fields(self._scan(scan, done_ns), binary=self._events)
-            self._wire.send(frame(b"sSN LMDscandata " + body, binary=self._events), done_ns)
+            self._wire.send(frame(b"sSN LMDscandata " + body, binary=self._events), done_ns, whole=True)
 
     def _one_scan(self, request: _Request, now_ns: int) -> None:
         """The newest complete scan."""

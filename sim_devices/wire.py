@@ -15,6 +15,7 @@ class _Message:
     ready_ns: int
     data: bytes
     rate_after_bps: int | None
+    whole: bool
     sent: int = 0
 
 
@@ -31,9 +32,13 @@ class PacedWire:
         self._free_ns = now_ns
         self._promised_ns = now_ns
 
-    def send(self, data: bytes, now_ns: int, rate_after_bps: int | None = None) -> None:
-        """Queue a message that is ready at now_ns. rate_after_bps: the line's rate once it has left."""
-        self._waiting.append(_Message(now_ns, data, rate_after_bps))
+    def send(self, data: bytes, now_ns: int, rate_after_bps: int | None = None, *, whole: bool = False) -> None:
+        """Queue a message that is ready at now_ns.
+
+        rate_after_bps: the line's rate once it has left.  whole: it takes its time on the line, but a USB chip behind
+        it hands it on in one packet.
+        """
+        self._waiting.append(_Message(now_ns, data, rate_after_bps, whole))
         self._promised_ns = max(self._promised_ns, now_ns) + self._duration_ns(len(data))
 
     def leave_by(self, now_ns: int) -> bytes:
@@ -43,7 +48,8 @@ class PacedWire:
             first = self._waiting[0]
             start_ns = max(first.ready_ns, self._free_ns)
             room = max(0, now_ns - start_ns) * self.rate_bps // (BITS_PER_BYTE * SECOND_NS)
-            count = min(len(first.data) - first.sent, room)
+            left = len(first.data) - first.sent
+            count = 0 if first.whole and room < left else min(left, room)
             out += first.data[first.sent : first.sent + count]
             first.sent += count
             if count:
@@ -76,7 +82,8 @@ class PacedWire:
             return None
         first = self._waiting[0]
         start_ns = max(first.ready_ns, self._free_ns)
-        return start_ns + min(self._duration_ns(len(first.data) - first.sent), BURST_NS)
+        duration_ns = self._duration_ns(len(first.data) - first.sent)
+        return start_ns + (duration_ns if first.whole else min(duration_ns, BURST_NS))
 
     def _duration_ns(self, count: int) -> int:
         """Time that so many bytes take, rounded up, so that `leave_by` at that instant has them all."""

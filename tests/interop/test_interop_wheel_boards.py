@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import serial
 
+from drivers.encoder_cia406 import Cia406PairConversation
 from drivers.encoder_odrive import ODrivePairConversation
 from drivers.ports import CanPort
 from drivers.reader import WireReader
@@ -248,6 +249,55 @@ def test_canopen_finds_an_encoder_and_sets_up_its_pdos(tmp_path: Path) -> None:
             assert heard[1][-1] > heard[1][0]
         finally:
             network.disconnect()
+
+
+@needs("durand")
+def test_our_driver_sets_up_and_reads_nodes_of_durand() -> None:
+    """Another project's CANopen device: its PDOs are delivered empty, its heartbeat off."""
+    durand: Any = importlib.import_module("durand")
+    kinds = importlib.import_module("durand.datatypes").DatatypeEnum
+    clock = importlib.import_module("durand.scheduler").SyncScheduler()
+    durand.set_scheduler(clock)
+    clock.add(3600.0, id, (0,))
+    threading.Thread(target=clock.run, daemon=True).start()
+    channel, stop = "nodes of durand", threading.Event()
+    nodes = []
+    for number in (0x20, 0x21):
+        bus = can.Bus(interface="virtual", channel=channel)
+        node = importlib.import_module("durand.node").MinimalNode(durand.CANBusNetwork(bus), number)
+        objects = node.object_dictionary
+        objects.write(0x1000, 0, 0x00020196)
+        objects.write(0x1008, 0, b"DURAND ENCODER")
+        for index, value in ((0x6001, 4096), (0x6002, 1 << 24), (0x6004, 0)):
+            objects[index] = durand.Variable(kinds.UNSIGNED32, "ro", value)
+        nodes.append(objects)
+
+    def turn() -> None:
+        start = time.monotonic()
+        while not stop.wait(0.002):
+            way = int(4096 * (time.monotonic() - start))
+            for objects, sign in zip(nodes, (1, -1)):
+                objects.write(0x6004, 0, sign * way % (1 << 24))
+
+    threading.Thread(target=turn, daemon=True).start()
+    heard: list[WheelReading] = []
+    reader = WireReader(
+        "can",
+        lambda: CanPort(interface="virtual", channel=channel, clock=time.monotonic_ns),
+        {"drive": Cia406PairConversation(0x20, 0x21)},
+        lambda _, item: heard.append(item) if isinstance(item, WheelReading) else None,
+        clock=time.monotonic_ns,
+    )
+    reader.start()
+    time.sleep(3.0)
+    told = reader.health().sources["drive"]
+    reader.stop()
+    stop.set()
+    assert told.identity is not None and told.identity.model == "DURAND ENCODER"
+    assert len(heard) > 200
+    seconds = (heard[-1].stamp_ns - heard[0].stamp_ns) * 1e-9
+    assert heard[-1].left_ticks - heard[0].left_ticks == pytest.approx(4096 * seconds, rel=0.03)
+    assert heard[-1].right_ticks - heard[0].right_ticks == pytest.approx(-4096 * seconds, rel=0.03)
 
 
 def test_bridge_by_a_blocking_serial_client(tmp_path: Path) -> None:

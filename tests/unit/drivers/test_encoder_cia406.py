@@ -490,6 +490,29 @@ def test_a_disabled_and_wrongly_mapped_pdo_is_put_right() -> None:
     assert bench.nodes[0].objects[0x1801, 1] == number(0x280 + LEFT, 4)
 
 
+@pytest.mark.parametrize(("count", "first"), [(0, 0), (2, 0x60040020), (0, 0x60040020)])
+def test_a_pdo_of_nothing_or_of_more_than_the_position_is_mapped(count: int, first: int) -> None:
+    """As general CANopen stacks deliver it: the object is there and says that nothing is mapped."""
+    bench = Bench()
+    for node in bench.nodes:
+        node.objects[0x1A01, 0] = number(count, 1)
+        node.objects[0x1A01, 1] = number(first, 4)
+    assert bench.run(200)
+    for node in bench.nodes:
+        assert node.objects[0x1A01, 0] == b"\1"
+        assert node.objects[0x1A01, 1] == number(0x60040020, 4)
+        assert int.from_bytes(node.objects[0x1801, 1], "little") >> 31 == 0
+
+
+def test_the_timer_s_pdo_is_mapped_too() -> None:
+    bench = Bench(Cia406PairConversation(LEFT, RIGHT, sampling="cyclic"))
+    for node in bench.nodes:
+        node.objects[0x1A00, 0] = b"\0"
+        node.objects[0x1A00, 1] = number(0, 4)
+    assert bench.run(200)
+    assert all(node.objects[0x1A00, 1] == number(0x60040020, 4) for node in bench.nodes)
+
+
 def test_wrap_both_ways_through_the_range_of_the_device() -> None:
     bench = Bench()
     for node in bench.nodes:

@@ -108,6 +108,15 @@ def test_bridge_line_feed_ends_nothing() -> None:
     assert talk(board, b"e\r", 3 * SECOND) == b"0 0\r\n"
 
 
+def test_bridge_replies_come_whole_when_their_last_character_has_left() -> None:
+    board, _ = bridge()
+    board.step(2 * SECOND, b"r\r")
+    pieces = {at_ns: board.step(2 * SECOND + at_ns, b"") for at_ns in range(0, MS, 10_000)}
+    at_ns, text = next((at_ns, piece) for at_ns, piece in pieces.items() if piece)
+    assert text == b"OK\r\n"
+    assert at_ns == pytest.approx(200_000 + 4 * 10 * SECOND / 57600, abs=10_000)
+
+
 def test_bridge_motors_stop_two_seconds_after_the_last_command() -> None:
     board, _ = bridge()
     talk(board, b"m 10 -20\r", 2 * SECOND)
@@ -266,6 +275,37 @@ def test_claw_keeps_settings_and_stops_when_nobody_talks() -> None:
     for at_ns in range(6 * SECOND, 7 * SECOND, 10 * MS):
         board.step(at_ns, bytes.fromhex("8010"))
     assert (scene.base["left"] / TURN_M * 1000) % 1000 == pytest.approx(0.5 * 256 + 64, abs=10)
+
+
+def write_claw(board: RoboClaw, now_ns: int, *packet: int) -> str:
+    text = bytes(packet)
+    return ask(board, (text + crc16_ccitt(text).to_bytes(2, "big")).hex(), now_ns)
+
+
+@pytest.mark.parametrize(("wide", "modes"), [(False, (1, 2, 3)), (True, (1, 2, 3, 4, 5))])
+def test_claw_has_modes_of_three_pins_or_of_five(wide: bool, modes: tuple[int, ...]) -> None:
+    board, _ = claw(wide_pins=wide)
+    assert write_claw(board, SECOND, 0x80, 74, *modes) == "FF"
+    answer = bytes.fromhex(ask(board, "804B", 2 * SECOND))
+    assert tuple(answer[:-2]) == modes
+    assert write_claw(board, 3 * SECOND, 0x80, 80, 0xE2, 0x2E, 0xAB, 0x7A) == "FF"  # as delivered
+    assert bytes.fromhex(ask(board, "804B", 4 * SECOND))[:-2] == bytes(len(modes))
+
+
+def test_claw_takes_limits_of_batteries_by_byte() -> None:
+    board, _ = claw()
+    assert [write_claw(board, k * SECOND, 0x80, 2 + k, value) for k, value in enumerate((30, 154))] == ["FF", "FF"]
+    assert struct.unpack(">HHB", bytes.fromhex(ask(board, "803B", 3 * SECOND))[:5])[:2] == (120, 301)
+
+
+def test_claw_drives_and_turns_by_seven_bits() -> None:
+    board, scene = claw(top_ticks_per_s=1000.0)
+    for at, (command, value, left, right) in enumerate(
+        [(8, 64, 504, 504), (10, 32, 756, 252), (13, 64, 504, 504), (12, 64, 0, 0), (11, 127, -1000, 1000)], start=1
+    ):
+        assert write_claw(board, at * SECOND, 0x80, command, value) == "FF"
+        told = [1000.0 * scene.speed[side] / TURN_M for side in ("left", "right")]
+        assert told == pytest.approx((left, right), abs=1)
 
 
 def test_claw_on_ttl_keeps_its_rate() -> None:
