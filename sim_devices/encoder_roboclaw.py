@@ -40,7 +40,8 @@ WIDE_PINS = "5B"  # 74 and 75 of newer firmware: CTRL1 and CTRL2 as well
 
 # What is only kept: command that writes -> (format, command that reads back, place in what that one returns).
 SETTINGS: dict[int, tuple[str, int, int]] = {
-    2: ("B", 59, 0), 3: ("B", 59, 1), 14: ("B", 15, 0), 26: ("B", 60, 0), 27: ("B", 60, 1), 28: ("IIII", 55, 0), 29: ("IIII", 56, 0), 57: ("HHB", 59, 0), 58: ("HH", 60, 0),
+    2: ("B", 59, 0), 3: ("B", 59, 1), 14: ("B", 15, 0), 26: ("B", 60, 0), 27: ("B", 60, 1),
+    28: ("IIII", 55, 0), 29: ("IIII", 56, 0), 57: ("HHB", 59, 0), 58: ("HH", 60, 0),
     61: ("7I", 63, 0), 62: ("7I", 64, 0), 68: ("II", 81, 0), 69: ("II", 81, 2), 70: ("H", 72, 0), 71: ("H", 72, 1),
     74: ("BBB", 75, 0), 76: ("BBHHHHHBBHHHHH", 77, 0), 92: ("B", 91, 0), 93: ("B", 91, 1), 98: ("H", 99, 0),
     105: ("I", 107, 0), 106: ("I", 107, 1), 109: ("HH", 110, 0), 112: ("HH", 113, 0), 115: ("BB", 116, 0),

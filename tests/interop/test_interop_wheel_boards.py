@@ -293,7 +293,8 @@ def test_our_driver_sets_up_and_reads_nodes_of_durand() -> None:
     told = reader.health().sources["drive"]
     reader.stop()
     stop.set()
-    assert told.identity is not None and told.identity.model == "DURAND ENCODER"
+    assert told.identity is not None
+    assert told.identity.model == "DURAND ENCODER"
     assert len(heard) > 200
     seconds = (heard[-1].stamp_ns - heard[0].stamp_ns) * 1e-9
     assert heard[-1].left_ticks - heard[0].left_ticks == pytest.approx(4096 * seconds, rel=0.03)
