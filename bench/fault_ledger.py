@@ -96,7 +96,7 @@ class Device:
     table: Callable[[], Table]
     source: str
     target: str
-    wire: str = "serial"  # serial, tcp, can
+    wire: str = "serial"  # serial, tcp, udp, can
     model: str | None = None
 
     @property
@@ -155,6 +155,12 @@ DEVICES: dict[str, Device] = {
     "MAVLink, distances": Device(
         lambda: with_sonars("mavlink", port="/dev/ttyACM0", baud_bps=115200), "side", "autopilot"
     ),
+    "MAVLink over UDP, distances": Device(
+        lambda: with_sonars("mavlink", port="udpin:127.0.0.1:14550"), "side", "autopilot", "udp"
+    ),
+    "MAVLink over UDP, wheels": Device(
+        lambda: with_wheels("mavlink", 628318.5, port="udpout:127.0.0.1:14550"), "drive", "autopilot", "udp"
+    ),
     "MAVLink, wheels": Device(
         lambda: with_wheels("mavlink", 628318.5, port="/dev/ttyACM0", baud_bps=115200), "drive", "autopilot"
     ),
@@ -198,6 +204,7 @@ SERIAL = [
     Trouble(("flood=20000",), "counted"),
 ]
 TCP = [*CUT, *SUPPLY, *(Trouble((kind,), "counted") for kind in ("drop=0.3", "add=0.3", "flip=0.3"))]
+UDP = [*TCP, Trouble(("flood=20000",), "counted")]  # a flood: another program sends to the same port
 NODE = [*CUT, *SUPPLY]
 BUS = [
     *(Trouble((kind,), target="bus.main") for kind in ("unplug", "silence", "stall", "bus_off")),
@@ -213,7 +220,7 @@ SWITCH = [Trouble((kind,), "blocked", target=f"contact.bumpers.{SWITCH_LINE}") f
 
 def troubles_of(device: Device) -> list[Trouble]:
     """All faults of a device that must show."""
-    found = {"serial": SERIAL, "tcp": TCP, "can": [*NODE, *BUS]}[device.wire]
+    found = {"serial": SERIAL, "tcp": TCP, "udp": UDP, "can": [*NODE, *BUS]}[device.wire]
     if device.target.startswith("laser"):
         found = [*found, *LASER]
     if device.target.startswith("contact"):

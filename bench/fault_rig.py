@@ -117,6 +117,39 @@ class MemoryPort:
             raise PortAbsent(f"{self.name} was lost: check its cable and power")
 
 
+class MemoryUdpPort:
+    """The daemon's UDP socket: it stays open whatever becomes of who speaks there, and knows nobody before he spoke."""
+
+    silence_reopen_s: float | None = None
+
+    def __init__(self, link: MemoryLink, name: str, clock: Callable[[], int]) -> None:
+        self.name = name
+        self.drops: dict[str, int] = {}
+        self._link = link
+        self._clock = clock
+        self._has_peer = name.startswith("udpout")
+
+    def read(self, timeout_s: float) -> list[tuple[bytes, int]]:
+        datagrams = self._link.host_read() if self._link.is_open else b""
+        self._has_peer = self._has_peer or bool(datagrams)
+        return [(datagrams, self._clock())] if datagrams else []
+
+    def write(self, item: bytes) -> None:
+        if not self._has_peer:
+            self.drops["no_peer"] = self.drops.get("no_peer", 0) + 1
+        elif self._link.is_open:
+            self._link.host_write(item)
+
+    def set_baud(self, bits_per_s: int) -> None:
+        """UDP has no speed to set."""
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+    def fileno(self) -> int | None:
+        return None
+
+
 class Rig:
     """A robot of emulated devices and what the daemon makes of it, on a clock of its own.
 
@@ -254,6 +287,8 @@ class Rig:
         baud = None if on_tcp or device.can_bus() else getattr(device, "baud_bps", None)
 
         def open_port() -> Port[Any]:
+            if (address := device.serial_port() or "").startswith("udp"):
+                return MemoryUdpPort(link, address, lambda: self.now_ns)
             line = MemoryPort(link, name, baud, lambda: self.now_ns, on_tcp=on_tcp)
             return _MemoryCanPort(line, lambda: self.now_ns) if wire.name.startswith("can-") else line
 

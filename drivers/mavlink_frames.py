@@ -5,7 +5,8 @@
 
 CRC-16/MCRF4XX (initial FFFF, reflected 1021h) over everything behind the first byte, then over the message's own
 CRC_EXTRA byte, which ties it to the layout below. In v2 trailing zeros of the payload are cut; the reader puts them
-back. A message whose CRC_EXTRA is not known here cannot be checked and is passed over byte by byte.
+back. A message whose CRC_EXTRA is not known here cannot be checked and is passed over byte by byte, though not counted
+as noise where it has a header: autopilots send dozens of kinds.
 
 Why not pymavlink here: its parser gives up a whole frame's length at a wrong CRC, true frames within included, takes
 its version from an environment variable, and its tables cost 30 MB. It judges this file in the tests instead.
@@ -115,10 +116,12 @@ class Frames:
     def __init__(self, counters: SourceCounters) -> None:
         self._counters = counters
         self._buffer = bytearray()
+        self._foreign = 0  # bytes still to come of a message that is not known here
 
     def clear(self) -> None:
         """Forget half a frame."""
         self._buffer.clear()
+        self._foreign = 0
 
     def feed(self, chunk: bytes) -> Iterator[tuple[Message, int]]:
         """The messages that a chunk completes, each with how many bytes of the chunk came after it."""
@@ -132,6 +135,7 @@ class Frames:
             if message is None:
                 at = self._next_start(at + 1)
                 continue
+            self._foreign = 0
             at += size
             yield message, len(self._buffer) - at
         del self._buffer[:at]
@@ -145,8 +149,30 @@ class Frames:
             tail = max(at, len(self._buffer) - _V2_HEADER + 1)
             mark = _MARK.search(self._buffer, tail)
             start = len(self._buffer) if mark is None else mark.start()
-        self._counters.drop("noise_bytes", start - at + 1)
+        self._pass_over(at - 1, start)
         return start
+
+    def _pass_over(self, at: int, end: int) -> None:
+        """Count what is no known message: noise, or a frame of another kind (its header tells how long it is)."""
+        noise = 0
+        while at < end:
+            self._foreign = self._foreign or self._foreign_size(at)
+            known = min(self._foreign, end - at)
+            self._foreign -= known
+            noise += not known
+            at += known or 1
+        if noise:
+            self._counters.drop("noise_bytes", noise)
+
+    def _foreign_size(self, at: int) -> int:
+        """Size of the frame of a kind not known here that begins at this byte, 0 if none does."""
+        head = self._buffer[at : at + _V2_HEADER]
+        if head[0] == _V2 and len(head) == _V2_HEADER and not head[2] & ~_SIGNED and not head[9]:
+            known = int.from_bytes(head[7:10], "little") in LAYOUTS
+            return 0 if known else _V2_HEADER + head[1] + _CRC_SIZE + (_SIGNATURE_SIZE if head[2] & _SIGNED else 0)
+        if head[0] == _V1 and len(head) >= _V1_HEADER and head[5] not in LAYOUTS:
+            return _V1_HEADER + head[1] + _CRC_SIZE
+        return 0
 
     def _size_at(self, at: int) -> int | None:
         """Size of the frame that begins here: 0 if none can, None if more bytes are needed to tell or to have it."""

@@ -3,8 +3,9 @@
 Sources: MAVLink common.xml; ArduPilot AP_Proximity_MAV.cpp, PX4 CollisionPrevention.cpp.
 
 What this emulator does that a naive one would not:
-- HEARTBEAT and SYS_STATUS once a second; attitude, odometry, wheel distances and rangefinders at rates of their own,
-  which SET_MESSAGE_INTERVAL changes (0: as before, -1: off). Nothing is sent before it has started.
+- HEARTBEAT, SYS_STATUS and GPS_RAW_INT (no satellites indoors) once a second; attitude, odometry, wheel distances and
+  rangefinders at rates of their own, which SET_MESSAGE_INTERVAL changes (0: as before, -1: off), and on ArduPilot
+  REQUEST_DATA_STREAM for whole groups. Nothing is sent before it has started.
 - Odometry is dead reckoning of its own wheels, forward-right-down: y and yaw grow to the right.
 - A rangefinder that hears nothing says one more than its maximum; one that something is too near for says its minimum
   less one.
@@ -45,6 +46,17 @@ FRAMES_OF_PX4 = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_LOCAL_NED, mavlink.
 ORIENTATION_DEG = 45.0
 NOT_KNOWN = math.nan
 MAX_HZ = 1000.0
+
+# Groups of REQUEST_DATA_STREAM; 0 is all of them.
+GROUPS: dict[int, tuple[int, ...]] = {
+    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (mavlink.MAVLINK_MSG_ID_SYS_STATUS, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT),
+    mavlink.MAV_DATA_STREAM_POSITION: (mavlink.MAVLINK_MSG_ID_ODOMETRY,),
+    mavlink.MAV_DATA_STREAM_EXTRA1: (mavlink.MAVLINK_MSG_ID_ATTITUDE,),
+    mavlink.MAV_DATA_STREAM_EXTRA3: (
+        mavlink.MAVLINK_MSG_ID_WHEEL_DISTANCE,
+        mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,
+    ),
+}
 
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 Parameter = tuple[str, int, float]  # name, type, value
@@ -182,6 +194,7 @@ class MavlinkAutopilot:
         self._streams = [
             _Stream(mavlink.MAVLINK_MSG_ID_HEARTBEAT, 1.0, self._heartbeat),
             _Stream(mavlink.MAVLINK_MSG_ID_SYS_STATUS, 1.0, self._sys_status),
+            _Stream(mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, 1.0, self._gps),
             _Stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 10.0, self._attitude),
             _Stream(mavlink.MAVLINK_MSG_ID_ODOMETRY, 10.0, self._odometry),
             _Stream(mavlink.MAVLINK_MSG_ID_WHEEL_DISTANCE, 10.0, self._wheel_distance),
@@ -244,6 +257,11 @@ class MavlinkAutopilot:
             bit = mavlink.MAV_SYS_STATUS_OBSTACLE_AVOIDANCE
         healthy = bit if np.isfinite(self._fresh(now_ns)).any() or self._hears_obstacles(now_ns) else 0
         return [self._codec.sys_status_encode(bit, bit, healthy, 100, 12600, -1, 90, 0, 0, 0, 0, 0, 0)]
+
+    def _gps(self, now_ns: int) -> list[Any]:
+        no_fix, unknown = mavlink.GPS_FIX_TYPE_NO_FIX, 65535
+        stamp_us = self.clock_us(now_ns)
+        return [self._codec.gps_raw_int_encode(stamp_us, no_fix, 0, 0, 0, unknown, unknown, unknown, unknown, 0)]
 
     def _attitude(self, now_ns: int) -> list[Any]:
         self._reckon(now_ns)
@@ -350,6 +368,8 @@ class MavlinkAutopilot:
         sender = message.get_srcSystem(), message.get_srcComponent()
         if kind == "MISSION_REQUEST_LIST":
             self._say(self._codec.mission_count_encode(*sender, 0, message.mission_type), now_ns)
+        if kind == "REQUEST_DATA_STREAM" and self.kind == "ardupilot":
+            self._set_group(message, now_ns)
         if kind == "PARAM_REQUEST_LIST":
             for place in range(len(self._parameters)):
                 self._say(self._parameter(place), now_ns)
@@ -363,6 +383,15 @@ class MavlinkAutopilot:
             if kind == "PARAM_SET":
                 self._set_parameter(place, message.param_value)
             self._say(self._parameter(place), now_ns)
+
+    def _set_group(self, message: Any, now_ns: int) -> None:
+        """The old way to ask for rates. A sensor that is not there stays silent."""
+        every = tuple(member for group in GROUPS.values() for member in group)
+        members = every if message.req_stream_id == 0 else GROUPS.get(message.req_stream_id, ())
+        hz = float(message.req_message_rate) if message.start_stop else 0.0
+        for stream in self._streams:
+            if stream.message_id in members and stream.usual_hz:
+                stream.set_rate(min(MAX_HZ, hz), now_ns)
 
     def _set_parameter(self, place: int, told: float) -> None:
         name, kind, _ = self._parameters[place]

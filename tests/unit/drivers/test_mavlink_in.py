@@ -72,6 +72,34 @@ def test_crc_check_value_and_extras_agree_with_the_dialect() -> None:
         assert (theirs.crc_extra, theirs.unpacker.size) == (layout.crc_extra, layout.fields.size)
 
 
+@pytest.mark.parametrize("version", [1, 2])
+@given(data=st.data())
+def test_messages_of_other_kinds_are_no_noise_and_hide_nothing(version: int, data: st.DataObject) -> None:
+    """Autopilots send dozens of kinds; noise is still counted, to the byte."""
+    codec = peer(version)
+    others = [
+        codec.sys_status_encode(1, 1, 1, 100, 12600, -1, 90, 0, 0, 0, 0, 0, 0),
+        codec.gps_raw_int_encode(9, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0),
+        codec.statustext_encode(6, b"EKF is using GPS"),
+    ]
+    known = codec.heartbeat_encode(10, 3, 1, 0, 4)
+    stream, beats, noise = b"", 0, 0
+    for _ in range(data.draw(st.integers(1, 12))):
+        kind = data.draw(st.integers(0, 4))
+        stream += b"\x11\x22\x33" if kind == 4 else (known if kind == 3 else others[kind]).pack(codec)
+        beats += kind == 3
+        noise += 3 * (kind == 4)
+    counters = SourceCounters()
+    frames = Frames(counters)
+    found = 0
+    while stream:
+        size = data.draw(st.integers(1, 60))
+        found += sum(message.message_id == HEARTBEAT for message, _ in frames.feed(stream[:size]))
+        stream = stream[size:]
+    assert found == beats
+    assert counters.drops.get("noise_bytes", 0) == noise
+
+
 def test_published_frames() -> None:
     found, drops = messages(b"".join(VECTORS))
     assert [each.message_id for each in found] == [HEARTBEAT, DISTANCE_SENSOR, WHEEL_DISTANCE]

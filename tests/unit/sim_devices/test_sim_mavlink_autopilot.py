@@ -191,6 +191,21 @@ def test_message_intervals_follow_commands() -> None:
     assert bench.tell(command(511, 9000, 1000, system=9)) == b""
 
 
+def test_groups_of_messages_have_rates_the_old_way() -> None:
+    """REQUEST_DATA_STREAM, which tools for ArduPilot still send; a PX4 does not know it."""
+    for kind, per_second in (("ardupilot", 4), ("px4", 10)):
+        bench = Bench(kind=kind, rangefinders=[Rangefinder(0, Mount())])
+        codec = mavlink.MAVLink(None, srcSystem=255)
+        bench.tell(codec.request_data_stream_encode(1, 1, mavlink.MAV_DATA_STREAM_EXTRA3, 4, 1).pack(codec))
+        said = bench.wait(5.0)
+        assert len(of(said, "DISTANCE_SENSOR")) == pytest.approx(5 * per_second, abs=1)
+        assert len(of(said, "ATTITUDE")) == pytest.approx(50, abs=1)
+        assert len(of(said, "GPS_RAW_INT")) == pytest.approx(5, abs=1)
+        bench.tell(codec.request_data_stream_encode(1, 1, mavlink.MAV_DATA_STREAM_ALL, 4, 0).pack(codec))
+        if kind == "ardupilot":
+            assert {message.get_type() for message in read(bench.wait(3.0))} == {"HEARTBEAT"}
+
+
 @pytest.mark.parametrize("asked", [(512, 148), (520, 1)])
 def test_version_is_told_when_asked_for(asked: tuple[int, int]) -> None:
     bench = Bench()
