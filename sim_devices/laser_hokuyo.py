@@ -19,6 +19,7 @@ What this emulator does that a naive one would not:
   is lost to framing errors.
 - Before the motor is up to speed streams are accepted and wait; GD is held back until a first scan exists.
 - RB twice: the answers still leave, then the device is deaf for half a second and starts from scratch.
+- One that starts in SCIP 1.1 answers V, G, L and S of that version until it is sent SCIP2.0.
 - An empty line is not answered. A second measuring command replaces the stream that runs.
 - Assumed, the papers being silent: distances past 4095 mm are clipped in MS and GS; a start before AMIN is allowed and
   gives "not measurable"; HD, HE, ND and NE are unknown commands on these models (0E).
@@ -398,6 +399,7 @@ class HokuyoLaser:
         self._first_turn = 0
         self._time_mode = False
         self._sensitive = False
+        self._dark = False  # in SCIP 1
         self._reboot_asked_ns: int | None = None
         self._rebooting = False
         self._last_command = b""
@@ -472,17 +474,44 @@ class HokuyoLaser:
             handler(command, semicolon + free, now_ns)
 
     def _obey_scip1(self, line: bytes, now_ns: int) -> None:
-        if line == b"SCIP2.0":
-            self._scip1 = False
-            self._wire.send(line + b"\n0\n\n", now_ns)
-        elif line == b"V":
-            told = (("VEND", self.profile.vendor), ("PROD", self.profile.product), ("FIRM", self.profile.firmware),
-                    ("PROT", "00003,(SCIP 1.0)"), ("SERI", self._serial))  # fmt: skip
-            self._wire.send(
-                b"V\n0\n" + "".join(f"{key}:{value}\n" for key, value in told).encode("ascii") + b"\n", now_ns
-            )
-        else:
+        """V, G, L and S of SCIP 1.1, without sums: echo, one character of status, lines, an empty line."""
+        match line[:1], len(line):
+            case b"V", 1:
+                told = (("VEND", self.profile.vendor), ("PROD", self.profile.product), ("FIRM", self.profile.firmware),
+                        ("PROT", "00003,(SCIP 1.0)"), ("SERI", self._serial))  # fmt: skip
+                self._answer_scip1(line, "".join(f"{key}:{value}\n" for key, value in told).encode("ascii"), now_ns)
+            case b"G", 9:
+                self._scan_scip1(line, now_ns)
+            case b"L", 2 if line[1:] in (b"0", b"1"):
+                self._dark = line == b"L0"
+                self._answer_scip1(line, b"", now_ns)
+            case b"S", 14 if (rate_bps := _digits(line[1:7])) in LINE_RATES:
+                self._answer_scip1(line, b"", now_ns, rate_bps if self.link == "rs232" else None)
+            case _ if line == b"SCIP2.0":
+                self._scip1 = False
+                self._answer_scip1(line, b"", now_ns)
+            case _:
+                self._wire.send(line + b"\nE\n\n", now_ns)
+
+    def _answer_scip1(self, echo: bytes, lines: bytes, now_ns: int, rate_after_bps: int | None = None) -> None:
+        self._wire.send(echo + b"\n0\n" + lines + b"\n", now_ns, rate_after_bps)
+
+    def _scan_scip1(self, line: bytes, now_ns: int) -> None:
+        """`G` start end cluster: two characters a value, 64 to a line. The beam is on from power-on."""
+        start, end, cluster = _digits(line[1:4]), _digits(line[4:7]), _digits(line[7:9])
+        newest = (now_ns - self._turn_zero_ns) // self._period_ns
+        while self._turn_done_ns(newest) > now_ns:
+            newest -= 1
+        if start is None or end is None or cluster is None or self._dark or newest < 0:
             self._wire.send(line + b"\nE\n\n", now_ns)
+        elif not start <= end <= self.profile.last_accepted_step:
+            self._wire.send(line + b"\nE\n\n", now_ns)
+        else:
+            ranges_mm, intensity = self._measure(start, end, self._turn_start_ns(newest))
+            ranges_mm, _ = self._clustered(ranges_mm, intensity, max(1, cluster))
+            characters = encode_numbers(np.minimum(ranges_mm, MAX_RANGE_2_CHARS), 2).tobytes()
+            blocks = (characters[at : at + BLOCK] + b"\n" for at in range(0, len(characters), BLOCK))
+            self._answer_scip1(line, b"".join(blocks), now_ns)
 
     def _answer(self, echo: bytes, status: str, now_ns: int, lines: bytes = b"") -> None:
         reply = echo + b"\n" + sealed(status.encode("ascii")) + lines + b"\n"

@@ -257,6 +257,30 @@ def test_power_up_in_scip_1() -> None:
     assert bench.ask(b"SCIP2.0\n") == b"SCIP2.0\n0Ee\n\n"
 
 
+def test_scans_of_scip_1_have_two_characters_a_value_and_no_sums() -> None:
+    """What drivers of the first URGs ask; ranges are 1000 mm and up from step 44 on."""
+    bench = Bench(start_in_scip1=True)
+    bench.wait(1.0)
+    reply = bench.ask(b"G04408301\n")
+    assert reply.startswith(b"G04408301\n0\n?X?Y?Z?[?\\?]?^?_")
+    lines = reply.rstrip(b"\n").split(b"\n")[2:]
+    assert [len(line) for line in lines] == [64, 16]
+    digits = np.frombuffer(b"".join(lines), np.uint8).astype(int) - 0x30
+    assert list(digits[::2] * 64 + digits[1::2]) == list(range(1000, 1040))
+    assert bench.ask(b"G04405104\n") == b"G04405104\n0\n?X?\\\n\n"  # the nearest of four
+    assert [bench.ask(b"L0\n"), bench.ask(b"G04405104\n")] == [b"L0\n0\n\n", b"G04405104\nE\n\n"]
+    assert [bench.ask(b"L1\n"), bench.ask(b"G04408399\n")[:12]] == [b"L1\n0\n\n", b"G04408399\n0\n"]
+    for wrong in (b"G083044001\n", b"G08304401\n", b"G04476901\n", b"S1234567654321\n", b"G0x408301\n"):
+        assert bench.ask(wrong) == wrong + b"E\n\n"
+
+
+def test_scip_1_changes_its_rate_after_the_answer() -> None:
+    bench = Bench(start_in_scip1=True, link="rs232")
+    bench.wait(1.0)
+    assert bench.ask(b"S1152007654321\n", 0.05, baud=19200) == b"S1152007654321\n0\n\n"
+    assert bench.ask(b"V\n", 0.2, baud=115200).startswith(b"V\n0\nVEND:")
+
+
 @pytest.mark.data
 @pytest.mark.skipif(not os.environ.get("UMFELD_DATA"), reason="needs UMFELD_DATA")
 def test_greeting_has_the_form_of_the_recorded_one() -> None:
