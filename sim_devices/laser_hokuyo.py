@@ -502,16 +502,15 @@ class HokuyoLaser:
         newest = (now_ns - self._turn_zero_ns) // self._period_ns
         while self._turn_done_ns(newest) > now_ns:
             newest -= 1
-        if start is None or end is None or cluster is None or self._dark or newest < 0:
+        fits = start is not None and end is not None and start <= end <= self.profile.last_accepted_step
+        if start is None or end is None or cluster is None or not fits or self._dark or newest < 0:
             self._wire.send(line + b"\nE\n\n", now_ns)
-        elif not start <= end <= self.profile.last_accepted_step:
-            self._wire.send(line + b"\nE\n\n", now_ns)
-        else:
-            ranges_mm, intensity = self._measure(start, end, self._turn_start_ns(newest))
-            ranges_mm, _ = self._clustered(ranges_mm, intensity, max(1, cluster))
-            characters = encode_numbers(np.minimum(ranges_mm, MAX_RANGE_2_CHARS), 2).tobytes()
-            blocks = (characters[at : at + BLOCK] + b"\n" for at in range(0, len(characters), BLOCK))
-            self._answer_scip1(line, b"".join(blocks), now_ns)
+            return
+        ranges_mm, intensity = self._measure(start, end, self._turn_start_ns(newest))
+        ranges_mm, _ = self._clustered(ranges_mm, intensity, max(1, cluster))
+        characters = encode_numbers(np.minimum(ranges_mm, MAX_RANGE_2_CHARS), 2).tobytes()
+        blocks = (characters[at : at + BLOCK] + b"\n" for at in range(0, len(characters), BLOCK))
+        self._answer_scip1(line, b"".join(blocks), now_ns)
 
     def _answer(self, echo: bytes, status: str, now_ns: int, lines: bytes = b"") -> None:
         reply = echo + b"\n" + sealed(status.encode("ascii")) + lines + b"\n"
