@@ -281,7 +281,7 @@ class RoboClaw:
         else:
             self._write(command, list(struct.unpack(">" + form, packet[2:-2])), now_ns)
             answer = ACKNOWLEDGED
-        self._wire.send(answer, now_ns + ANSWER_NS)
+        self._wire.send(answer, now_ns + ANSWER_NS, whole=self._baud is None)  # one packet on USB
 
     # -- reading ------------------------------------------------------------------------------------------------------
 

@@ -308,6 +308,14 @@ def test_claw_drives_and_turns_by_seven_bits() -> None:
         assert told == pytest.approx((left, right), abs=1)
 
 
+def test_claw_on_usb_answers_in_one_packet() -> None:
+    """Drivers that read once for each question rely on it."""
+    board, _ = claw()
+    board.step(SECOND, bytes.fromhex("8015"))
+    pieces = [board.step(SECOND + at_ns, b"") for at_ns in range(0, MS, 10_000)]
+    assert [len(piece) for piece in pieces if piece] == [len(b"USB Roboclaw 2x15a v4.2.4\n\0") + 2]
+
+
 def test_claw_on_ttl_keeps_its_rate() -> None:
     board, _ = claw(link="ttl", baud_bps=38400)
     assert board.step(SECOND, bytes.fromhex("8010"), 115200) == b""
