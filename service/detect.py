@@ -180,7 +180,7 @@ PROBES = (
     Probe("maxbotix", "sonars", (9600,), (), _maxbotix, 0.9),
     Probe("mavlink", "wheels", (57600, 115200), (), _mavlink, 1.1),
     Probe("hokuyo", "lasers", (115200, 19200, 57600, 38400), (b"VV\n",), _hokuyo),
-    Probe("sick_lms2xx", "lasers", (9600, 38400, 19200, 500000), (bytes.fromhex("020001003a"),), _sick, 0.5),
+    Probe("sick_lms2xx", "lasers", (9600, 38400, 19200, 500000), (bytes.fromhex("020001003a1e12"),), _sick, 0.5),
     Probe("rplidar", "lasers", (115200, 256000), (b"\xa5\x25", b"\xa5\x50"), _rplidar),
     Probe("usboard-serial", "sonars", (19200,), (bytes(8),), _usboard),
     Probe("roboclaw", "wheels", (38400, 115200), (b"\x80\x15",), _roboclaw, 0.2),

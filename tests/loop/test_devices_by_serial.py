@@ -18,9 +18,16 @@ from service.config_files import Layers
 from sim_devices.attach import Attachment, PtyLink
 from sim_devices.device import Mount
 from sim_devices.encoder_arduino_bridge import ArduinoBridge
+from sim_devices.encoder_roboclaw import RoboClaw
 from sim_devices.laser_hokuyo import HokuyoLaser
 from sim_devices.laser_ldrobot import LdLidar
 from sim_devices.laser_rplidar import RpLidar
+from sim_devices.laser_sick_lms2xx import SickLms2xxLaser
+from sim_devices.mavlink_autopilot import MavlinkAutopilot
+from sim_devices.slcan_hub import CanBus, CanBusStation
+from sim_devices.sonar_maxbotix import MaxBotix
+from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardSerial
+from sim_devices.wheel import Wheel
 
 F64 = NDArray[np.float64]
 
@@ -106,14 +113,24 @@ def test_a_laser_that_is_not_there_is_told_by_its_number(tmp_path: Path) -> None
 def test_detect_names_what_is_on_each_port_in_time_and_side_by_side(tmp_path: Path) -> None:
     attachment = Attachment()
     room = Room(2.0)
-    devices = {
+    wheels = Wheel(room, "left", 0.1, 1000.0), Wheel(room, "right", 0.1, 1000.0)
+    devices: dict[str, Any] = {
         "hokuyo": HokuyoLaser(room, serial="H0614967"),
+        "sick_lms2xx": SickLms2xxLaser(room),
         "rplidar": RpLidar(room),
         "ldrobot": LdLidar(room),
         "arduino-bridge": ArduinoBridge(None, None),
+        "roboclaw": RoboClaw(*wheels, link="ttl"),
+        "usboard-serial": UsBoardSerial(UsBoard(room, {1: Transducer(Mount())})),
+        "maxbotix": MaxBotix(room, Mount()),
+        "mavlink": MavlinkAutopilot(room),
     }
     for name, device in devices.items():
-        attachment.add(name, device, PtyLink(tmp_path / name))  # type: ignore[arg-type]
+        attachment.add(name, device, PtyLink(tmp_path / name))
+    adapter = CanBusStation(CanBus())
+    adapter.add_member("host", PtyLink(tmp_path / "slcan"))
+    attachment.add_station("slcan", adapter)
+    devices["slcan"] = adapter
     silent = PtyLink(tmp_path / "silent")
     attachment.start()
     try:
