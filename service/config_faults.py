@@ -111,7 +111,12 @@ def _short(value: Any) -> str:
 
 def _unknown_key(path: KeyPath, model: type[BaseModel], data: Mapping[str, Any]) -> str:
     known = sorted(fields_at(model, path[:-1], data))
+    inside = [name for name in known if path[-1] in fields_at(model, (*path[:-1], name), data)]
+    if "port" in known and "driver" in known:
+        known = sorted((*known, "serial"))  # stands for the port
     near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+    if inside:
+        return f"unknown key; did you mean {inside[0]}.{path[-1]}?"
     if near:
         return f"unknown key; did you mean {near[0]}?"
     return f"unknown key; known here: {', '.join(known)}"

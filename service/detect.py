@@ -135,8 +135,10 @@ def _usboard(data: bytes) -> Identity | None:
 
 def _maxbotix(data: bytes) -> Identity | None:
     lines = data.split(b"\r")[1:-1]  # the first and the last may be torn
-    good = sum(re.fullmatch(rb"R\d{3,5}", line) is not None for line in lines)
-    return Identity("MaxBotix") if good >= 2 and good >= 0.8 * len(lines) else None
+    good = [line for line in lines if re.fullmatch(rb"R\d{3,5} ?", line)]
+    if len(good) < 2 or len(good) < 0.8 * len(lines):
+        return None
+    return Identity("MaxBotix", f"{len(good[-1].strip()) - 1} digits")
 
 
 def _arduino(data: bytes) -> Identity | None:

@@ -180,25 +180,36 @@ def _print_detected(found: list[Detected]) -> None:
 
 
 def _as_toml(found: list[Detected]) -> str:
-    """Tables to begin with; names are to be changed."""
+    """Tables to begin with, which `umfeld check` takes as they are; names are to be changed, sizes to be measured."""
     lines = []
     counts: dict[str, int] = {}
     for each in found:
         if not each.driver:
             continue
         number = counts[each.section] = counts.get(each.section, 0) + 1
-        lines.append(f"[{each.section}.{_FIRST_NAMES[each.section]}{'' if number == 1 else number}]")
+        name = f"{_FIRST_NAMES[each.section]}{'' if number == 1 else number}"
+        lines.append(f"[{each.section}.{name}]")
         if each.section == "can":
-            lines += ['interface = "slcan"', f"channel = {json.dumps(each.best_name)}"]
-        else:
-            lines.append(f"driver = {json.dumps(each.driver)}")
-            serial = each.identity.serial if each.identity is not None else ""
-            lines.append(f"serial = {json.dumps(serial)}" if serial else f"port = {json.dumps(each.best_name)}")
+            lines += ['interface = "slcan"', f"channel = {json.dumps(each.best_name)}", ""]
+            continue
+        lines.append(f"driver = {json.dumps(each.driver)}")
+        serial = each.identity.serial if each.identity is not None else ""
+        lines.append(f"serial = {json.dumps(serial)}" if serial else f"port = {json.dumps(each.best_name)}")
+        if each.speed_bps not in (None, _USUAL_BPS.get(each.driver, each.speed_bps)):
+            lines.append(f"baud_bps = {each.speed_bps}")
+        if each.driver == "maxbotix":
+            digits = each.identity.model if each.identity is not None else ""
+            lines.append(f'family = "{"lv" if digits.startswith("3") else "hr-5m"}"    # {_FAMILIES}')
         lines.append("")
+        if each.section == "wheels" and number == 1:
+            lines += ["[drive]", f'source = "{name}"', f"# {_DRIVE}", ""]
     return "\n".join(lines)
 
 
 _FIRST_NAMES = {"lasers": "front", "sonars": "ring", "wheels": "drive", "can": "main"}
+_USUAL_BPS = {"arduino-bridge": 57600, "roboclaw": 38400, "mavlink": 57600}  # of drivers that do not look for it
+_FAMILIES = "as printed on the sensor: lv, xl, hr-5m or hr-10m"
+_DRIVE = "measure: wheel_radius_left_m, wheel_radius_right_m, track_width_m, ticks_per_turn_left, ticks_per_turn_right"
 
 
 def _watched(ports: list[str] | None, config: Path | None) -> tuple[Config, dict[str, str]]:

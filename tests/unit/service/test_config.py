@@ -107,6 +107,14 @@ def test_the_configuration_of_the_architecture_page_is_valid(tmp_path: Path) -> 
         ("[robto]\n", "1: robto: unknown key; did you mean robot?"),
         ("[robot]\nidd = 'x'\n", "2: robot.idd: unknown key; did you mean id?"),
         ("[grid]\nresolution = 0.05", "2: grid.resolution: unknown key; did you mean resolution_m?"),
+        (
+            "[lasers.front]\ndriver = 'rplidar'\nport = '/dev/ttyUSB0'\ny_m = 0.2",
+            "4: lasers.front.y_m: unknown key; did you mean mount.y_m?",
+        ),
+        (
+            "[lasers.front]\ndriver = 'rplidar'\nport = '/dev/ttyUSB0'\nserail = 'AA55'",
+            "4: lasers.front.serail: unknown key; did you mean serial?",
+        ),
         ("[grid]\n\nresolution_m = '5 cm'", "3: grid.resolution_m: is '5 cm', expected a number"),
         ("[grid]\nresolution_m = nan", "2: grid.resolution_m: is nan, expected a finite number"),
         ("[grid]\nresolution_m = 0.0", "2: grid.resolution_m: is 0.0, .*0.005"),

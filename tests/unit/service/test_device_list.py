@@ -10,7 +10,25 @@ import pytest
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
+from drivers.readings import Identity
+from service.commands.devices import _as_toml
+from service.config import load
+from service.detect import PROBES, Detected, Probe
 from service.device_list import can_interfaces, permission_trouble, serial_ports
+
+
+@pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.driver)
+@pytest.mark.parametrize("serial", ["", "H0614967"])
+def test_tables_that_detect_prints_are_a_configuration(probe: Probe, serial: str, tmp_path: Path) -> None:
+    said = Identity(model="3 digits" if probe.driver == "maxbotix" else "", serial=serial)
+    found = [Detected("/dev/ttyUSB0", "", probe.driver, probe.section, 115200, said)]
+    path = tmp_path / "umfeld.toml"
+    path.write_text(_as_toml(found))
+    config = load(path, environment={}).config
+    device = next((device for _, _, device in config.devices()), None)
+    assert (device is None) == (probe.section == "can")
+    if probe.driver in ("arduino-bridge", "roboclaw", "mavlink"):  # which do not look for the speed
+        assert getattr(device, "baud_bps", None) == 115200
 
 
 def test_a_port_is_shown_by_the_name_that_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
