@@ -4,9 +4,11 @@
 
 Cases: buildings of the simulator (mit: 2 km of corridor, mit8: seen up to 8 m, plain: without a door or a bin between
 the crossings, halls: two loops of 400 m, alike: parallel corridors 7.5 m apart, alike_plain: those without doors, bare:
-one loop of 230 m without doors), 180 degrees at 1 degree as an old SICK, and recordings whose poses others corrected
-(belgioioso, seattle, acapulco). Odometry is made from the true poses: a scale that is off, turns that are off, a
-heading that drifts and wanders, slips (`Wheels`).
+one loop of 230 m without doors, aces, aces8: four courts whose corridors are the same but for open doors, killian,
+killian8: loops of 200 to 700 m along a corridor of 250 m, four corridors of ten bare, half a metre between scans; the
+laser of these four sees 80 m or 8 m and errs by 2 cm), 180 degrees at 1 degree as an old SICK, and recordings whose
+poses others corrected (belgioioso, seattle, acapulco). Odometry is made from the true poses: a scale that is off, turns
+that are off, a heading that drifts and wanders, slips (`Wheels`).
 
 A pair of visits: scans less than PAIR_M and PAIR_RAD apart in truth and at least 60 s and 30 m of way apart. Its error
 is what the relation error of the benchmark is: inverse(true) * (inverse(a) * b).  A closure is false if it is off the
@@ -115,8 +117,27 @@ ALIKE = BigBuilding(
 )  # fmt: skip
 
 
-def simulated(name: str, building: BigBuilding, seed: int, *, range_m: float = 30.0, hertz: float = 5.0) -> Case:
-    """A drive through a building, the laser erring by a centimetre and telling whole centimetres."""
+COURTS = BigBuilding(
+    columns_m=(0.0, 27.0, 55.0), rows_m=(0.0, 26.0, 54.0), alike=True,
+    tour=(
+        (0, 0), (1, 0), (1, 1), (0, 1), (0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2), (0, 1), (1, 1), (1, 2), (2, 2),
+        (2, 1), (1, 1), (1, 0), (0, 0), (0, 2), (2, 2), (2, 0), (0, 0),
+    ),
+)  # fmt: skip
+KILLIAN = BigBuilding(
+    columns_m=(0.0, 38.0, 96.0, 171.0, 250.0), rows_m=(0.0, 52.0, 118.0, 205.0), bare_share=0.4,
+    tour=(
+        (0, 0), (4, 0), (4, 1), (2, 1), (2, 0), (1, 0), (1, 3), (3, 3), (3, 1), (4, 1), (4, 0), (2, 0), (2, 2), (1, 2),
+        (1, 0), (0, 0), (0, 1), (2, 1), (2, 3), (4, 3), (4, 0), (0, 0),
+    ),
+)  # fmt: skip
+
+
+def simulated(
+    name: str, building: BigBuilding, seed: int, *, range_m: float = 30.0, hertz: float = 5.0, noise_m: float = 0.012,
+    wheels: Wheels | None = None,
+) -> Case:  # fmt: skip
+    """A drive through a building, the laser erring by noise_m and telling whole centimetres."""
     plan = building.plan(seed)
     assert plan.route is not None
     world, motion = World.from_plan(plan, seed), follow(plan.route)
@@ -131,9 +152,9 @@ def simulated(name: str, building: BigBuilding, seed: int, *, range_m: float = 3
         reach = world.beam_distances(
             origin, sensor.yaw_rad + bearing, np.full(len(bearing), now_s), z_m=0.3, range_max_m=range_m
         )
-        reach = np.round((reach + rng.normal(0.0, 0.012, len(reach))) * 100.0) / 100.0
+        reach = np.round((reach + rng.normal(0.0, noise_m, len(reach))) * 100.0) / 100.0
         scans.append(Scan(round(now_s * 1e9), 0.0, bearing, reach, 0.05, range_m))
-    return Case(name, tuple(scans), truth, Wheels().odometry(truth, rng), MOUNT)
+    return Case(name, tuple(scans), truth, (wheels or Wheels()).odometry(truth, rng), MOUNT)
 
 
 def recorded(name: str, _: int, *, seed_of_wheels: int = 0) -> Case:
@@ -159,6 +180,10 @@ CASES: dict[str, Callable[[int], Case]] = {
     "alike": partial(simulated, "alike", ALIKE),
     "alike_plain": partial(simulated, "alike_plain", replace(ALIKE, bare=True)),
     "bare": partial(simulated, "bare", BARE),
+    "aces": partial(simulated, "aces", COURTS, range_m=80.0, noise_m=0.02, wheels=Wheels(way_share=0.04)),
+    "aces8": partial(simulated, "aces8", COURTS, range_m=8.0, noise_m=0.02, wheels=Wheels(way_share=0.04)),
+    "killian": partial(simulated, "killian", KILLIAN, range_m=80.0, noise_m=0.02, hertz=2.0),
+    "killian8": partial(simulated, "killian8", KILLIAN, range_m=8.0, noise_m=0.02, hertz=2.0),
     "belgioioso": lambda seed: recorded("belgioioso", seed, seed_of_wheels=seed),
     "seattle": lambda seed: recorded("seattle", seed, seed_of_wheels=seed),
     "acapulco": lambda seed: recorded("acapulco", seed, seed_of_wheels=seed),

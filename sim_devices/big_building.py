@@ -31,7 +31,8 @@ WEAVE_EVERY_M = 12.0
 class BigBuilding:
     """columns_m, rows_m: where corridors lie.  tour: crossings in the order they are driven.  half_m: of a corridor's
     width.  door_every_m: between doors.  open_share, glass_share: of doors and of the pieces of wall between doors.
-    bare: no niches, bins or benches, nothing but straight walls between crossings."""
+    bare: no niches, bins or benches, nothing but straight walls between crossings; bare_share: of the corridors, those
+    that are so in any case.  alike: doors stand at the same places in every corridor, no crossing is a lobby."""
 
     columns_m: tuple[float, ...]
     rows_m: tuple[float, ...]
@@ -41,6 +42,8 @@ class BigBuilding:
     open_share: float = 0.08
     glass_share: float = 0.05
     bare: bool = False
+    bare_share: float = 0.0
+    alike: bool = False
     speed_m_s: float = 0.9
 
     def plan(self, seed: int) -> FloorPlan:
@@ -60,7 +63,7 @@ class _Draft:
     def plan(self) -> FloorPlan:
         pairs = {tuple(sorted(pair)) for pair in self._legs()}
         for crossing in sorted({c for pair in pairs for c in pair}):
-            lobby = self._rng.random() < 0.35
+            lobby = self._rng.random() < 0.35 and not self._b.alike
             self._half[crossing] = self._b.half_m + (float(self._rng.uniform(0.8, 2.5)) if lobby else 0.0)
         open_sides = {(a, _side(a, b)) for pair in pairs for a, b in (pair, pair[::-1])}
         for crossing in self._half:
@@ -106,21 +109,22 @@ class _Draft:
         start, end = self._place(a), self._place(b)
         length = abs(end[0] - start[0]) + abs(end[1] - start[1]) - self._half[a] - self._half[b]
         begin = (start[0] + self._half[a] * along[0], start[1] + self._half[a] * along[1])
+        bare = self._b.bare or (self._b.bare_share > 0.0 and self._rng.random() < self._b.bare_share)
         for hand in (1.0, -1.0):
-            self._wall(begin, along, (hand * left[0], hand * left[1]), length)
+            self._wall(begin, along, (hand * left[0], hand * left[1]), length, bare=bare)
 
-    def _wall(self, begin: Point, along: Point, out: Point, length: float) -> None:
+    def _wall(self, begin: Point, along: Point, out: Point, length: float, *, bare: bool) -> None:
         """One wall of a corridor: out points from its middle to this wall."""
 
         def at(t: float, depth: float = 0.0) -> Point:
             off = self._b.half_m + depth
             return begin[0] + t * along[0] + off * out[0], begin[1] + t * along[1] + off * out[1]
 
-        if self._b.bare:
+        if bare:
             self._walls.append(Wall((at(0.0), at(length)), 0.0))
             return
         rng, t = self._rng, 0.0
-        door = float(rng.uniform(0.8, 0.8 + self._b.door_every_m))
+        door = 2.0 if self._b.alike else float(rng.uniform(0.8, 0.8 + self._b.door_every_m))
         while door + DOOR_M < length - 0.5:
             material = "glass" if rng.random() < self._b.glass_share else "wall"
             self._walls.append(Wall((at(t), at(door)), 0.0, material))

@@ -30,9 +30,9 @@ from mapping.features.moments import arc_weights, centre_of_gravity, smoothed_in
 from mapping.features.vectors import Feature, FeatureSpace, Scale
 from mapping.frames import Pose2, wrap_angle, wrap_angles
 from mapping.kernels import features as kernels
-from mapping.kernels.localise_match import EMPTY, surface_normals
+from mapping.kernels.localise_table import EMPTY
 from mapping.localise.scan_match import agreement, match_view
-from mapping.localise.views import ROUGHNESS_M, BearingTable, View, ViewArrays, ViewStore, table_for, view_of
+from mapping.localise.views import BearingTable, View, ViewArrays, ViewStore, fill_normals, table_for, view_of
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -458,6 +458,6 @@ def _unpacked(payload: bytes) -> tuple[Sight, Pose2]:
     table = BearingTable(first, width, bins, closed > 0.0)
     quality = np.where(filled, 0.0, EMPTY).astype(np.float32)
     nx, ny = np.zeros(bins, dtype=np.float32), np.zeros(bins, dtype=np.float32)
-    normals = surface_normals(px, py, table.frame(), nx, ny, quality, ROUGHNESS_M)
+    normals = fill_normals(px, py, table.frame(), nx, ny, quality)
     view = View(table, px, py, nx, ny, quality, int(filled.sum()), normals)
     return Sight(AnchorGraph(Anchors(rows)), view, scene_vector(_points(view))), Pose2(x, y, yaw)

@@ -1,14 +1,7 @@
-"""Compiled loops of scan matching: a scan as a table of bearings, its surface normals, and point-to-line alignment.
+"""Compiled loops of scan matching: point-to-line alignment of a view on others, and how they agree.
 
-A scan is kept as a table of bearing bins ("view"), so that the neighbours of a point in another scan are found by
-its bearing there and not by a tree. A view's arrays are (B,) float32, a store of views has them as (K, B):
-
-    x, y     mean end point of the beams in the bin, sensor frame [m]; 0 where the bin is empty
-    nx, ny   unit normal of the surface there, towards the sensor; 0 where there is none
-    quality  EMPTY no point, 0 a point without a normal, up to 1 a point on a straight surface
-    frame    (4,) float64 of a view: bearing of the first bin's lower edge, width of a bin, bins, 1 if they close a turn
-
-Poses are rows (x, y, yaw) in float64. Bounds: every index is clipped or wrapped before it is used.
+Views are as in localise_table. Poses are rows (x, y, yaw) in float64. Bounds: every index is clipped or wrapped before
+it is used.
 """
 
 from __future__ import annotations
@@ -19,203 +12,16 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-EMPTY = -1.0
-FIRST, WIDTH, BINS, CLOSED = 0, 1, 2, 3
+from mapping.kernels.localise_table import BINS, CLOSED, EMPTY, GRAZING_GAP_M, WIDTH, bearing_of, bin_of
 
-NEIGHBOURS = 8  # points on either side that may define a normal
 WIDEST_BINS = 24.0  # half of the widest window of bearings that is searched
 ASIDE_SLACK_RAD = 1e-4  # more than bearing_of and the rounding of points are off
 FARTHEST_ASIDE_RAD = 1.4
 FACING = 0.6  # cosine: surfaces that meet under a larger angle are not the same one
+GRAZING_SHARE = 0.75  # of the spacing of beams on a wall: how far from one of its points the wall is taken to go on
 
 LEVELS = 4
 RESULT_POSE, RESULT_HESSIAN, RESULT_COST, RESULT_COUNT, RESULT_STEPS, RESULT_LENGTH = 0, 3, 9, 10, 11, 12
-
-
-@njit(cache=True, nogil=True)
-def bearing_of(x: float, y: float) -> float:
-    """atan2(y, x) to within 1e-5 rad, several times as fast; 0 for the origin."""
-    ax, ay = abs(x), abs(y)
-    high, low = max(ax, ay), min(ax, ay)
-    if high == 0.0:
-        return 0.0
-    a = low / high
-    s = a * a
-    angle = a + a * s * (-0.332966 + s * (0.1951828 + s * (-0.1198186 + s * (0.0558058 - s * 0.0128082))))
-    if ay > ax:
-        angle = 0.5 * math.pi - angle
-    if x < 0.0:
-        angle = math.pi - angle
-    return -angle if y < 0.0 else angle
-
-
-@njit(cache=True, nogil=True)
-def bin_of(bearing: float, frame: Any) -> Any:
-    """Bin of a bearing, whole turns taken off; may lie outside an open table."""
-    turn = 2.0 * math.pi
-    behind = bearing - frame[FIRST]
-    middle = 0.5 * frame[BINS] * frame[WIDTH]
-    behind -= turn * math.floor((behind - middle) / turn + 0.5)
-    return math.floor(behind / frame[WIDTH])
-
-
-@njit(cache=True, nogil=True)
-def fill_table(
-    bearing: Any, distance: Any, nearest_m: float, farthest_m: float, frame: Any, x: Any, y: Any, quality: Any
-) -> int:
-    """Beams (N,) into a view: of each bin the nearest surface, the mean of its beams. Returns the number of points.
-
-    The mean of points of one straight surface lies on that surface, so nothing is biased by averaging.
-    """
-    bins = int(frame[BINS])
-    front = np.full(bins, np.inf)
-    share = np.zeros(bins, dtype=np.int64)
-    for b in range(len(x)):
-        x[b] = 0.0
-        y[b] = 0.0
-        quality[b] = EMPTY
-    at = np.full(len(bearing), -1, dtype=np.int64)
-    for i in range(len(bearing)):
-        r = distance[i]
-        if not (r >= nearest_m and r <= farthest_m) or not math.isfinite(bearing[i]):
-            continue
-        b = bin_of(bearing[i], frame)
-        if frame[CLOSED] > 0.0:
-            b %= bins
-        if 0 <= b < bins:
-            at[i] = b
-            front[b] = min(front[b], r)
-    sum_x, sum_y = np.zeros(bins), np.zeros(bins)
-    for i in range(len(bearing)):
-        b = at[i]
-        if b >= 0 and distance[i] <= front[b] + 0.05 + 0.01 * front[b]:
-            sum_x[b] += distance[i] * math.cos(bearing[i])
-            sum_y[b] += distance[i] * math.sin(bearing[i])
-            share[b] += 1
-    count = 0
-    for b in range(bins):
-        if share[b] > 0:
-            x[b] = sum_x[b] / share[b]
-            y[b] = sum_y[b] / share[b]
-            quality[b] = 0.0
-            count += 1
-    return count
-
-
-@njit(cache=True, nogil=True)
-def fill_depths(bearing: Any, distance: Any, frame: Any, nearest: Any, farthest: Any) -> None:
-    """Nearest and farthest finite range of the beams (N,) in each bin (B,); inf and -inf where there is none."""
-    bins = int(frame[BINS])
-    for b in range(bins):
-        nearest[b], farthest[b] = math.inf, -math.inf
-    for i in range(len(bearing)):
-        if not (math.isfinite(bearing[i]) and math.isfinite(distance[i])):
-            continue
-        b = bin_of(bearing[i], frame)
-        if frame[CLOSED] > 0.0:
-            b %= bins
-        if 0 <= b < bins:
-            nearest[b] = min(nearest[b], distance[i])
-            farthest[b] = max(farthest[b], distance[i])
-
-
-@njit(cache=True, nogil=True)
-def count_changed(
-    bearing: Any, distance: Any, sensor: Any, least_m: float, frame: Any, nearest: Any, farthest: Any,
-    slack_m: float, slack_share: float,
-) -> tuple[int, int]:  # fmt: skip
-    """Beams (N,), each from its own pose sensor (N, 3) in the frame of the bins, held against the surfaces there.
-
-    Returns how many could be judged, all three bins about their bearing having a surface, and how many of those end
-    neither between the nearest and the farthest of these nor within the slack of them.
-    """
-    bins = int(frame[BINS])
-    judged, changed = 0, 0
-    for i in range(len(bearing)):
-        r = distance[i]
-        if not (r >= least_m) or not math.isfinite(bearing[i]):
-            continue
-        at = bearing[i] + sensor[i, 2]
-        far = math.inf
-        if r < math.inf:
-            px, py = sensor[i, 0] + r * math.cos(at), sensor[i, 1] + r * math.sin(at)
-            at, far = bearing_of(px, py), math.sqrt(px * px + py * py)
-        middle = bin_of(at, frame)
-        low, high, found = math.inf, -math.inf, 0
-        for b in (middle - 1, middle, middle + 1):
-            if frame[CLOSED] > 0.0:
-                b %= bins
-            elif b < 0 or b >= bins:
-                continue
-            if nearest[b] < math.inf:
-                low, high, found = min(low, nearest[b]), max(high, farthest[b]), found + 1
-        if found < 3:
-            continue
-        judged += 1
-        slack = slack_m + slack_share * high
-        if far < low - slack or far > high + slack:
-            changed += 1
-    return judged, changed
-
-
-@njit(cache=True, nogil=True)
-def surface_normals(x: Any, y: Any, frame: Any, nx: Any, ny: Any, quality: Any, roughness_m: float) -> int:
-    """Normals of a view by principal components of each point's neighbours on the same surface; how many were found.
-
-    Neighbours are walked to on both sides while each lies near the one before it, within reach of the point. A point
-    whose neighbours are no line (second deviation above a third of the first) keeps quality 0.
-    """
-    bins = int(frame[BINS])
-    closed = frame[CLOSED] > 0.0
-    found = 0
-    for i in range(len(x)):
-        nx[i] = 0.0
-        ny[i] = 0.0
-    for i in range(bins):
-        if quality[i] == EMPTY:
-            continue
-        px, py = np.float64(x[i]), np.float64(y[i])
-        spacing = math.sqrt(px * px + py * py) * frame[WIDTH]
-        gap = min(max(0.12, 3.0 * spacing), 0.8)
-        reach = max(0.15, 2.5 * spacing)
-        count, sx, sy, sxx, sxy, syy = 1, 0.0, 0.0, 0.0, 0.0, 0.0
-        for side in (-1, 1):
-            last_x, last_y, k = px, py, i
-            for _ in range(NEIGHBOURS):
-                k += side
-                if closed:
-                    k = (k + bins) % bins
-                elif k < 0 or k >= bins:
-                    break
-                if quality[k] == EMPTY:
-                    continue
-                dx, dy = x[k] - px, y[k] - py
-                if (x[k] - last_x) ** 2 + (y[k] - last_y) ** 2 > gap * gap or dx * dx + dy * dy > reach * reach:
-                    break
-                last_x, last_y = np.float64(x[k]), np.float64(y[k])
-                count += 1
-                sx += dx
-                sy += dy
-                sxx += dx * dx
-                sxy += dx * dy
-                syy += dy * dy
-        if count < 3:
-            continue
-        mx, my = sx / count, sy / count
-        a, b, d = sxx / count - mx * mx, sxy / count - mx * my, syy / count - my * my
-        along = 0.5 * math.atan2(2.0 * b, a - d)
-        root = math.sqrt(0.25 * (a - d) ** 2 + b * b)
-        large, small = 0.5 * (a + d) + root, max(0.5 * (a + d) - root, 0.0)
-        if large <= 1e-9 or small > 0.12 * large:
-            continue
-        normal_x, normal_y = -math.sin(along), math.cos(along)
-        if normal_x * px + normal_y * py > 0.0:
-            normal_x, normal_y = -normal_x, -normal_y
-        nx[i] = normal_x
-        ny[i] = normal_y
-        quality[i] = 1.0 / (1.0 + small / (roughness_m * roughness_m))
-        found += 1
-    return found
 
 
 @njit(cache=True, nogil=True)
@@ -270,6 +76,37 @@ def nearest_bin(px: float, py: float, reach_m: float, coarse: bool, x: Any, y: A
 
 
 @njit(cache=True, nogil=True)
+def grazed_bin(
+    px: float, py: float, ux: float, uy: float, reach_m: float, x: Any, y: Any, nx: Any, ny: Any, quality: Any,
+    frame: Any,
+) -> int:  # fmt: skip
+    """The bin next to a point's bearing on whose wall, grazed by beams, the point (px, py) of normal (ux, uy) lies.
+
+    It lies within reach_m of the tangent line and no farther along it than beams of that view lie apart there; -1 if
+    there is none.
+    """
+    bins = int(frame[BINS])
+    middle = bin_of(bearing_of(px, py), frame)
+    best, at = reach_m, -1
+    for k in range(middle - 1, middle + 2):
+        b = k
+        if frame[CLOSED] > 0.0:
+            b = (b + bins) % bins
+        elif b < 0 or b >= bins:
+            continue
+        if not quality[b] > 0.0 or nx[b] * ux + ny[b] * uy < FACING:
+            continue
+        qx, qy = np.float64(x[b]), np.float64(y[b])
+        away = -(qx * nx[b] + qy * ny[b])
+        dx, dy = px - qx, py - qy
+        e = abs(dx * nx[b] + dy * ny[b])
+        along = abs(dy * nx[b] - dx * ny[b])
+        if e < best and along * away < GRAZING_SHARE * (qx * qx + qy * qy) * frame[WIDTH] and along < GRAZING_GAP_M:
+            best, at = e, b
+    return at
+
+
+@njit(cache=True, nogil=True)
 def add_pair(
     sx: Any, sy: Any, snx: Any, sny: Any, squality: Any, stride: int, offset: int,
     x: Any, y: Any, nx: Any, ny: Any, quality: Any, frame: Any,
@@ -290,7 +127,12 @@ def add_pair(
         px, py = rx + dx, ry + dy
         b = nearest_bin(px, py, reach_m, coarse, x, y, quality, frame)
         if b < 0:
-            continue
+            if not squality[i] > 0.0:
+                continue
+            tx, ty = c * snx[i] - s * sny[i], s * snx[i] + c * sny[i]
+            b = grazed_bin(px, py, tx, ty, reach_m, x, y, nx, ny, quality, frame)
+            if b < 0:
+                continue
         ux, uy = np.float64(nx[b]), np.float64(ny[b])
         if squality[i] > 0.0 and (c * snx[i] - s * sny[i]) * ux + (s * snx[i] + c * sny[i]) * uy < FACING:
             continue

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.kernels import motion
-from mapping.kernels.localise_match import count_changed, fill_depths
+from mapping.kernels.localise_table import count_changed, fill_depths
 from mapping.localise.views import BearingTable
 from mapping.scan import Scan
 

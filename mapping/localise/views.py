@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.kernels.localise_match import EMPTY, fill_table, surface_normals
+from mapping.kernels.localise_table import EMPTY, fill_table, grazing_normals, surface_normals
 from mapping.scan import Scan
 
 F32 = NDArray[np.float32]
@@ -82,7 +82,7 @@ NO_TABLE = BearingTable(0.0, 0.0, 0, False)
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One sweep in a table's bins; arrays (B,) float32 as described in mapping.kernels.localise_match."""
+    """One sweep in a table's bins; arrays (B,) float32 as described in mapping.kernels.localise_table."""
 
     table: BearingTable
     x: F32
@@ -105,8 +105,14 @@ def view_of(scan: Scan, table: BearingTable, *, farthest_m: float) -> View:
     if bearing.shape != distance.shape or bearing.ndim != 1:
         raise ValueError(f"bearings {bearing.shape} and ranges {distance.shape} of a scan must be rows of one length")
     points = fill_table(bearing, distance, nearest, farthest, frame, x, y, quality)
-    normals = surface_normals(x, y, frame, nx, ny, quality, ROUGHNESS_M)
+    normals = fill_normals(x, y, frame, nx, ny, quality)
     return View(table, x, y, nx, ny, quality, points, normals)
+
+
+def fill_normals(x: F32, y: F32, frame: F64, nx: F32, ny: F32, quality: F32) -> int:
+    """Set normals and quality of a view's points (B,); returns how many have one."""
+    near = surface_normals(x, y, frame, nx, ny, quality, ROUGHNESS_M)
+    return int(near + grazing_normals(x, y, frame, nx, ny, quality))
 
 
 @dataclass(frozen=True, slots=True)

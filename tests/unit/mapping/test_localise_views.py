@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.kernels.localise_match import EMPTY, bearing_of, bin_of
+from mapping.kernels.localise_table import EMPTY, bearing_of, bin_of
 from mapping.localise.views import MOST_BINS, ViewStore, table_for, view_of
 from mapping.scan import Scan
 
@@ -82,6 +82,37 @@ def test_points_and_normals_are_those_of_the_walls() -> None:
     inwards = -points * (np.abs(points) > 1.99) / 2.0
     assert np.abs(normals[flat] - inwards[flat]).max() < 1e-3
     assert np.all(view.quality[flat] > 0.99)
+
+
+def corridor_scan(yaw: float, noise_m: float, seed: int) -> Scan:
+    """A corridor 2.5 m wide, seen 180 degrees wide every degree."""
+    bearing = np.radians(np.arange(-90.0, 90.0))
+    distance = 1.25 / np.maximum(np.abs(np.sin(bearing + yaw)), 0.04)
+    distance = distance + np.random.default_rng(seed).normal(0.0, noise_m, len(bearing))
+    distance[distance > 20.0] = np.inf
+    return Scan(0, 0.0, bearing, distance, 0.05, 80.0)
+
+
+def test_walls_that_beams_graze_have_normals() -> None:
+    """Half a metre and more between beams, along a corridor: without these walls nothing holds the heading there."""
+    scan = corridor_scan(0.1, 0.02, 1)
+    view = view_of(scan, table_for(scan.bearing_rad), farthest_m=30.0)
+    far = np.hypot(view.x, view.y) > 4.0
+    assert far.sum() > 20
+    assert (view.quality[far] > 0.0).mean() > 0.75
+    along = math.cos(0.1) * view.nx - math.sin(0.1) * view.ny  # of the corridor
+    assert np.degrees(np.arcsin(np.abs(along[view.quality > 0.0]))).max() < 12.0
+    assert np.degrees(np.abs(np.arcsin(along[far & (view.quality > 0.0)]))).mean() < 1.5
+
+
+def test_scattered_points_are_no_grazed_wall() -> None:
+    rng = np.random.default_rng(3)
+    bearing = np.radians(np.arange(-90.0, 90.0))
+    shares = []
+    for _ in range(20):
+        scan = Scan(0, 0.0, bearing, rng.uniform(4.0, 15.0, len(bearing)), 0.05, 80.0)
+        shares.append(float((view_of(scan, table_for(bearing), farthest_m=30.0).quality > 0.0).mean()))
+    assert np.mean(shares) < 0.02
 
 
 def test_what_is_no_reading_leaves_an_empty_bin() -> None:
