@@ -9,9 +9,10 @@ All of it is one pure function of a snapshot (`Work.run`), so that a thread may 
    correlative search finds the place ("searched") and the matcher refines it.
 3. Tests of a single closure: most of the scan's points lie on surfaces the others saw, next to none lies in space
    they saw through; no second place fits nearly as well; the geometry holds the pose in every direction; the
-   correction is one that drift can explain.
+   correction is one that the covariance gathered along the way through the graph can explain.
 4. Probation: a searched closure counts only when others, found independently from other places of the way, ask for
-   the same correction. Tracked ones agree with the map already.
+   the same correction: the more of them and the farther apart, the less the covariance expects it. Tracked ones
+   agree with the map already.
 5. Optimisation with weights that let a false closure fall out; a group that does not survive it is undone.
 """
 
@@ -28,6 +29,7 @@ from mapping.frames import Pose2
 from mapping.localise.pose_graph import (
     Edges,
     Solution,
+    Uncertainty,
     covariance_of,
     mahalanobis,
     optimise,
@@ -42,7 +44,7 @@ from mapping.localise.scan_match import (
     match_view,
     weakest_information,
 )
-from mapping.localise.search import find_view, raster_of
+from mapping.localise.search import APART_M, APART_RAD, find_view, raster_of
 from mapping.localise.views import ViewArrays
 
 F64 = NDArray[np.float64]
@@ -62,8 +64,10 @@ class ClosureSettings:
     explained, overlap, mean_cost: of the points, see Agreement and Match; half_*: what still has half a vote.
     weakest_per_m2: least information in the worst direction.  rough_*: what still has rough_worth of a vote: outdoors
     nothing is a plane and little holds a pose, but nearly all that was seen is seen again.
+    surprise: squared Mahalanobis distance of a searched closure, by the covariance along the way, beyond which nothing
+    explains it; held_m: steps less sure than that are held by the wheels alone, see Uncertainty.
     agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way,
-    groups of rough ones over rough_way_m.
+    groups of rough ones over rough_way_m; doubled for each `doubling` of surprise.
     pending: how many closures wait at most.  undone_below: the weight under which a closure is forgotten in the end.
     floor_*: errors of a match that no matcher sees.  misfit: median squared distance of new closures from the map that
     makes an optimisation due; so do optimise_every new ones.
@@ -95,6 +99,9 @@ class ClosureSettings:
     rough_mean_cost: float = 0.60
     rough_weakest_per_m2: float = 250.0
     rough_worth: float = 0.34
+    surprise: float = 12.0
+    held_m: float = 0.0115
+    doubling: float = 4.0
     agreeing: int = 3
     agreeing_way_m: float = 1.2
     rough_way_m: float = 6.0
@@ -111,7 +118,8 @@ class Closure:
     """Key `to` seen from key `start`, an earlier one.
 
     information: (3, 3) in the frame of start.  worth: its vote on probation.  searched: found by search,
-    not from the estimate.  number: its name, for undoing; -1 until it is accepted.
+    not from the estimate.  number: its name, for undoing; -1 until it is accepted.  surprise: squared Mahalanobis
+    distance from where the way led, when it was found.
     """
 
     start: int
@@ -121,6 +129,7 @@ class Closure:
     worth: float
     searched: bool
     number: int = -1
+    surprise: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +190,7 @@ class Work:
     snapshot: Snapshot
     settings: ClosureSettings
     _events: Counter[str] = field(default_factory=Counter)
+    _uncertainty: Uncertainty | None = None
 
     def run(self) -> WorkResult:
         """Look for closures of the snapshot's keys, judge what is pending, optimise if it is worth it."""
@@ -327,6 +337,7 @@ class Work:
         shot, s = self.snapshot, self.settings
         view, here = shot.views.view(key), Pose2(*shot.poses[key].tolist())
         found: list[tuple[Closure, float]] = []
+        others: list[tuple[Pose2, float]] = []  # where it fits as well, here or there
         self._events["searches"] += 1
         for place in places:
             drift = float(self._drift(way_m[place]))
@@ -340,6 +351,7 @@ class Work:
                 continue
             if spot.rival > s.rival:
                 self._events["ambiguous"] += 1
+                others.append((spot.pose, spot.score))
                 continue
             if reach_m > s.place_m:
                 place = self._nearest(place, key, reach_m, spot.pose)
@@ -350,12 +362,33 @@ class Work:
                 found.append((closure, spot.score))
         if not found:
             return []
-        best = max(found, key=lambda entry: entry[1])[0]
-        if any(not self._same_correction(best, other, strict=False) for other, _ in found):
+        best, score = max(found, key=lambda entry: entry[1])
+        is_rivalled = any(
+            other_score > s.rival * score and _apart(Pose2(*shot.poses[best.start].tolist()) @ best.measured, pose)
+            for pose, other_score in others
+        )
+        if is_rivalled or any(not self._same_correction(best, other, strict=False) for other, _ in found):
             self._events["contradicting_places"] += 1
             return []
+        surprise = self._surprise(best)
+        if surprise > s.surprise:
+            self._events["beyond_drift"] += 1
+            return []
         self._events["searched"] += 1
-        return [best]
+        return [replace(best, surprise=surprise)]
+
+    def _surprise(self, closure: Closure) -> float:
+        """Squared Mahalanobis distance of a closure from where the way through the graph leads."""
+        shot = self.snapshot
+        if self._uncertainty is None:
+            edges = shot.path.joined(edges_of(shot.closures))
+            self._uncertainty = Uncertainty(
+                shot.poses, edges, weights_of(shot.poses, edges), held_m=self.settings.held_m
+            )
+        covariance = self._uncertainty.of_relative(closure.start, closure.to) + np.linalg.inv(closure.information)
+        return float(
+            mahalanobis(shot.poses, replace(edges_of([closure]), information=np.linalg.inv(covariance)[None]))[0]
+        )
 
     def _judged(
         self, key: int, place: int, rows: I64, match: Match | None, guess: Pose2, most_m: float, *, searched: bool
@@ -406,9 +439,12 @@ class Work:
                 best, votes = group, sum(worth.values())
         if votes < s.agreeing:
             return [], pending
+        doubt = 1.0 + float(np.median([pending[k].surprise for k in best])) / s.doubling
         way = [float(travel[pending[k].to]) for k in best]
         is_rough = sum(pending[k].worth >= 0.5 for k in best) < 2
-        if max(way) - min(way) < (s.rough_way_m if is_rough else s.agreeing_way_m):
+        if votes < doubt * s.agreeing or max(way) - min(way) < doubt * (
+            s.rough_way_m if is_rough else s.agreeing_way_m
+        ):
             return [], pending
         chosen = set(best)
         return [pending[k] for k in best], [c for k, c in enumerate(pending) if k not in chosen]
@@ -456,6 +492,12 @@ class Work:
 
     def _weights(self, poses: F64, closures: list[Closure]) -> F64:
         return weights_of(poses, self.snapshot.path.joined(edges_of(closures)))
+
+
+def _apart(a: Pose2, b: Pose2) -> bool:
+    """Whether two poses of one key are two places."""
+    off = a.inverse() @ b
+    return math.hypot(off.x_m, off.y_m) > APART_M or abs(off.yaw_rad) > APART_RAD
 
 
 def _numbered(closures: list[Closure], number: int) -> tuple[tuple[Closure, ...], int]:

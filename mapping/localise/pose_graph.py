@@ -145,6 +145,48 @@ def covariance_of(poses: F64, edges: Edges, weight: F64, key: int) -> F64:
     return np.asarray(0.5 * (block + block.T))
 
 
+class Uncertainty:
+    """How far poses of a graph may be off each other, its edges' errors being what they say they are.
+
+    But steps of the path that are less sure than held_m along themselves are not held by what was seen, but by the
+    wheels, and these err alike at each: of them a share that all have in common is added, as large as they are unsure.
+    Around a loop it cancels out; along a bare corridor it grows with the way and not with its root.
+    """
+
+    def __init__(self, poses: F64, edges: Edges, weight: F64, *, held_m: float) -> None:
+        """poses: (N, 3), at least two.  weight: (E,) of edges."""
+        self._poses = poses
+        pattern = _Pattern(len(poses), edges)
+        (wa, wb), self._factor = pattern.factor(poses, edges, weight)
+        self._together = np.asarray(self._factor.solve(pattern.pull(wa, wb, edges, _common_error(edges, held_m))))
+
+    def of_relative(self, start: int, to: int) -> F64:
+        """(3, 3) covariance of pose `to` seen from pose `start`, in the frame of start."""
+        pair = Edges(
+            np.array([start]), np.array([to]), np.zeros((1, 3)), np.zeros((1, 3, 3)), np.zeros(1, dtype=np.bool_)
+        )
+        a, b = _jacobians(self._poses, pair)
+        rows = np.concatenate((np.arange(3 * start, 3 * start + 3), np.arange(3 * to, 3 * to + 3)))
+        unit = np.zeros((len(self._together), 6))
+        unit[rows, np.arange(6)] = 1.0
+        by_pose = np.concatenate((a[0], b[0]), axis=1)
+        both = by_pose @ np.asarray(self._factor.solve(unit))[rows] @ by_pose.T
+        together = by_pose @ self._together[rows]
+        return np.asarray(0.5 * (both + both.T) + np.outer(together, together))
+
+
+def _common_error(edges: Edges, held_m: float) -> F64:
+    """(E, 3) in the frame of each edge's start: what may be common to steps of the path, along the way of each."""
+    off = np.zeros((len(edges), 3))
+    way = np.hypot(edges.measured[:, 0], edges.measured[:, 1])
+    moved = np.flatnonzero(~edges.doubtful & (way > 1e-3))
+    along = edges.measured[moved, :2] / way[moved, None]
+    covariance = np.linalg.inv(edges.information[moved])[:, :2, :2]
+    square = np.einsum("ni,nij,nj->n", along, covariance, along)
+    off[moved, :2] = along * np.sqrt(np.maximum(0.0, square - held_m**2))[:, None]
+    return off
+
+
 class _Pattern:
     """Where the blocks of the normal equations stand: the same for all steps of one optimisation."""
 
@@ -182,14 +224,18 @@ class _Pattern:
         (wa, wb), factor = self.factor(x, edges, weight)
         off = residuals(x, edges)
         off[:, 2] = wrap_angles(off[:, 2])
+        return np.asarray(factor.solve(self.pull(wa, wb, edges, off))).reshape(-1, 3)
+
+    def pull(self, wa: F64, wb: F64, edges: Edges, off: F64) -> F64:
+        """(3 N,) what residuals `off` (E, 3) pull at the poses, by the weighted Jacobians of both ends."""
         three = np.arange(3)
-        gradient = np.bincount(
+        pull = np.bincount(
             (3 * edges.start[:, None] + three).ravel(), np.einsum("nji,nj->ni", wa, off).ravel(), self._size
         )
-        gradient += np.bincount(
+        pull += np.bincount(
             (3 * edges.to[:, None] + three).ravel(), np.einsum("nji,nj->ni", wb, off).ravel(), self._size
         )
-        return np.asarray(factor.solve(gradient)).reshape(-1, 3)
+        return np.asarray(pull)
 
 
 def _jacobians(x: F64, edges: Edges) -> tuple[F64, F64]:

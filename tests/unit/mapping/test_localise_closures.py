@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -47,6 +50,33 @@ def test_so_many_votes_from_so_much_of_the_way_are_needed(
     judge, pending = work(votes, worth, step_m)
     group, waiting = judge._agreeing(pending)
     assert (len(group), len(waiting)) == ((votes, 0) if are_enough else (0, votes))
+
+
+@pytest.mark.parametrize(("surprise", "are_enough"), [(0.5, True), (4.0, False), (11.0, False)])
+def test_what_nobody_expected_needs_more_votes(surprise: float, are_enough: bool) -> None:
+    judge, pending = work(5, 1.0)
+    pending = [replace(c, surprise=surprise) for c in pending]
+    assert bool(judge._agreeing(pending)[0]) is are_enough
+    more = [replace(c, surprise=surprise) for c in work(24, 1.0)[1]]
+    assert judge._agreeing(more)[0]
+
+
+def test_what_the_way_cannot_explain_surprises() -> None:
+    """After 80 m round a square of sure steps a place 5 m beside cannot be that where the way began."""
+    side = [Pose2(0.5, 0.0, 0.0)] * 39 + [Pose2(0.5, 0.0, math.pi / 2.0)]
+    poses = [Pose2()]
+    for step in 4 * side:
+        poses.append(poses[-1] @ step)
+    rows = np.array([(p.x_m, p.y_m, p.yaw_rad) for p in poses])
+    steps = np.array([(p.x_m, p.y_m, p.yaw_rad) for p in 4 * side])
+    n = len(steps)
+    sure = np.repeat(np.diag([0.01**-2.0, 0.01**-2.0, math.radians(0.2) ** -2.0])[None], n, axis=0)
+    path = Edges(np.arange(n), np.arange(1, n + 1), steps, sure, np.zeros(n, dtype=np.bool_))
+    shot = Snapshot(ViewStore().arrays(), rows, 0.5 * np.arange(n + 1.0), path, (), (), (), 0, 0)
+    judge = Work(shot, ClosureSettings())
+    seen = np.diag([0.02**-2.0, 0.02**-2.0, math.radians(0.3) ** -2.0])
+    assert judge._surprise(Closure(0, n, Pose2(0.5, -0.6, 0.02), seen, 1.0, True)) < ClosureSettings().doubling
+    assert judge._surprise(Closure(0, n, Pose2(0.0, 5.0, 0.0), seen, 1.0, True)) > ClosureSettings().surprise
 
 
 def test_who_asks_for_another_correction_is_no_vote() -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mapping.frames import wrap_angles
 from mapping.localise.pose_graph import (
     Edges,
+    Uncertainty,
     composed_poses,
     covariance_of,
     mahalanobis,
@@ -112,3 +113,45 @@ def test_small_graphs() -> None:
     one = np.array([[1.0, 2.0, 3.0]])
     assert np.array_equal(optimise(one, Edges.none()).poses, one)
     assert np.array_equal(covariance_of(one, Edges.none(), np.zeros(0), 0), np.zeros((3, 3)))
+
+
+def chain(poses: F64, sigma_m: float, sigma_rad: float) -> Edges:
+    """Steps from pose to pose, all equally sure."""
+    pairs = [(k, k + 1) for k in range(len(poses) - 1)]
+    path = edges_between(poses, pairs, doubtful=False, noise=0.0, seed=0)
+    sure = np.diag([sigma_m**-2.0, sigma_m**-2.0, sigma_rad**-2.0])
+    return Edges(path.start, path.to, path.measured, np.repeat(sure[None], len(pairs), axis=0), path.doubtful)
+
+
+def test_uncertainty_along_a_path_is_that_of_its_steps() -> None:
+    poses = ring(40, 1)
+    path = chain(poses, 0.02, 0.01)
+    told = Uncertainty(poses, path, np.ones(39), held_m=1.0).of_relative(5, 30)
+    rng = np.random.default_rng(1)
+    ends = np.repeat(np.zeros((1, 3)), 20_000, axis=0)
+    for measured in path.measured[5:30]:
+        ends = composed_poses(ends, measured + rng.normal(0.0, 1.0, ends.shape) * [0.02, 0.02, 0.01])
+    np.testing.assert_allclose(told, np.cov(ends.T), rtol=0.1, atol=2e-4)
+
+
+def test_steps_that_wheels_alone_hold_err_together() -> None:
+    """Along a straight way with it, and not at all around a loop, where a gain that is wrong cancels out."""
+    straight = np.zeros((101, 3))
+    straight[:, 0] = 0.3 * np.arange(101)
+    sure = Uncertainty(straight, chain(straight, 0.01, 1e-4), np.ones(100), held_m=0.0115).of_relative(0, 100)
+    assert math.sqrt(sure[0, 0]) == pytest.approx(0.1, rel=0.01)
+    bare = Uncertainty(straight, chain(straight, 0.02, 1e-4), np.ones(100), held_m=0.0115).of_relative(0, 100)
+    assert math.sqrt(bare[0, 0]) > 100 * 0.016
+    assert math.sqrt(bare[1, 1]) < 0.25
+    loop = ring(101, 1)
+    around = Uncertainty(loop, chain(loop, 0.02, 1e-4), np.ones(100), held_m=0.0115).of_relative(0, 100)
+    assert math.sqrt(around[0, 0]) < 0.3
+
+
+def test_a_closure_takes_uncertainty_away() -> None:
+    poses = ring(61, 1)
+    path = chain(poses, 0.02, 0.01)
+    closure = edges_between(poses, [(0, 59)], doubtful=True, noise=0.0, seed=0)
+    before = Uncertainty(poses, path, np.ones(60), held_m=0.0115).of_relative(1, 58)
+    after = Uncertainty(poses, path.joined(closure), np.ones(61), held_m=0.0115).of_relative(1, 58)
+    assert np.trace(after) < 0.2 * np.trace(before)
