@@ -20,6 +20,9 @@ FARTHEST_ASIDE_RAD = 1.4
 FACING = 0.6  # cosine: surfaces that meet under a larger angle are not the same one
 GRAZING_SHARE = 0.75  # of the spacing of beams on a wall: how far from one of its points the wall is taken to go on
 
+SAME_PARTNERS = 0.01  # metres, and a third of radians: after a step that is smaller partners are not looked for again
+CONVERGED = 4e-4
+
 LEVELS = 4
 RESULT_POSE, RESULT_HESSIAN, RESULT_COST, RESULT_COUNT, RESULT_STEPS, RESULT_LENGTH = 0, 3, 9, 10, 11, 12
 
@@ -110,10 +113,12 @@ def grazed_bin(
 def add_pair(
     sx: Any, sy: Any, snx: Any, sny: Any, squality: Any, stride: int, offset: int,
     x: Any, y: Any, nx: Any, ny: Any, quality: Any, frame: Any,
-    dx: float, dy: float, turn: float, reach_m: float, scale_m: float, coarse: bool, sums: Any,
+    dx: float, dy: float, turn: float, reach_m: float, scale_m: float, coarse: bool, partner: Any, known: bool,
+    sums: Any,
 ) -> None:  # fmt: skip
     """Add one pair of views to the normal equations of (dx, dy, turn), the source's pose in the reference's frame.
 
+    partner: (B,) the reference's bin of each point of the source, -1 for none: found, or taken as it is if `known`.
     sums: (11,) upper triangle of H (6), gradient (3), robust cost, number of correspondences. Weights are those of
     Geman and McClure: (s^2 / (s^2 + e^2))^2 with s = scale_m, e the distance from the reference's tangent line.
     """
@@ -125,17 +130,24 @@ def add_pair(
             continue
         rx, ry = c * sx[i] - s * sy[i], s * sx[i] + c * sy[i]
         px, py = rx + dx, ry + dy
-        b = nearest_bin(px, py, reach_m, coarse, x, y, quality, frame)
-        if b < 0:
-            if not squality[i] > 0.0:
-                continue
-            tx, ty = c * snx[i] - s * sny[i], s * snx[i] + c * sny[i]
-            b = grazed_bin(px, py, tx, ty, reach_m, x, y, nx, ny, quality, frame)
+        if known:
+            b = partner[i]
             if b < 0:
                 continue
+        else:
+            partner[i] = -1
+            tx, ty = c * snx[i] - s * sny[i], s * snx[i] + c * sny[i]
+            b = nearest_bin(px, py, reach_m, coarse, x, y, quality, frame)
+            if b < 0:
+                if not squality[i] > 0.0:
+                    continue
+                b = grazed_bin(px, py, tx, ty, reach_m, x, y, nx, ny, quality, frame)
+                if b < 0:
+                    continue
+            if squality[i] > 0.0 and tx * nx[b] + ty * ny[b] < FACING:
+                continue
+            partner[i] = b
         ux, uy = np.float64(nx[b]), np.float64(ny[b])
-        if squality[i] > 0.0 and (c * snx[i] - s * sny[i]) * ux + (s * snx[i] + c * sny[i]) * uy < FACING:
-            continue
         e = (px - x[b]) * ux + (py - y[b]) * uy
         inside = square / (square + e * e)
         w = quality[b] * inside * inside
@@ -211,6 +223,8 @@ def align(
     result: (RESULT_LENGTH,) pose, upper triangle of H in points, robust cost, correspondences, steps (-1: failed).
     """
     pose = guess.copy()
+    partner = np.empty((len(rows), len(sx)), dtype=np.int32)
+    known = False
     total, sums = np.zeros(11), np.zeros(11)
     h, g, step = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     level = 0
@@ -227,7 +241,8 @@ def align(
             add_pair(
                 sx, sy, snx, sny, squality, stride, done % stride,
                 x[row], y[row], nx[row], ny[row], quality[row], frames[row],
-                c * dx + s * dy, c * dy - s * dx, pose[2] - ref[2], reach_m[level], scale_m[level], not last, sums,
+                c * dx + s * dy, c * dy - s * dx, pose[2] - ref[2], reach_m[level], scale_m[level], not last,
+                partner[k], known, sums,
             )  # fmt: skip
             add_turned(sums, ref[2], total)
         weight = 1.0 if last else 0.25  # coarse levels see a quarter of the pairs
@@ -249,8 +264,9 @@ def align(
         result[RESULT_STEPS] = done + 1.0
         if not last:
             level = LEVELS - 1 if moved < 0.04 else level + 1
-        elif moved < 4e-4:
+        elif moved < CONVERGED:
             break
+        known = last and moved < SAME_PARTNERS
     for a in range(3):
         result[RESULT_POSE + a] = pose[a]
     for a in range(6):

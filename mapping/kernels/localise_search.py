@@ -40,21 +40,22 @@ def draw_points(
 
 
 @njit(cache=True, nogil=True)
-def pool(fine: Any, block: int) -> Any:
-    """Raster whose cell (v, u) is the maximum of fine[v : v + block, u : u + block]."""
-    height, width = fine.shape
-    wide = np.zeros_like(fine)
-    for v in range(height):
-        for u in range(width):
-            best = fine[v, u]
-            for k in range(1, min(block, width - u)):
-                best = max(best, fine[v, u + k])
-            wide[v, u] = best
-    out = np.zeros_like(fine)
-    for v in range(height):
-        for k in range(min(block, height - v)):
+def pool(raster: Any, times: int, step: int) -> Any:
+    """Raster whose cell (v, u) is the maximum of raster[v + i step, u + j step], i and j below times, a power of two.
+
+    Of a copy pooled over `step` cells that is one pooled over times * step.
+    """
+    height, width = raster.shape
+    out = raster.copy()
+    shift = step
+    while shift < times * step:
+        for v in range(height):
+            for u in range(width - shift):
+                out[v, u] = max(out[v, u], out[v, u + shift])
+        for v in range(height - shift):
             for u in range(width):
-                out[v, u] = max(out[v, u], wide[v + k, u])
+                out[v, u] = max(out[v, u], out[v + shift, u])
+        shift *= 2
     return out
 
 
@@ -71,36 +72,15 @@ def score_at(raster: Any, cx: Any, cy: Any, dx: int, dy: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def pool_again(pooled: Any, block: int, times: int) -> Any:
-    """Maxima over times * block cells each way, from a copy pooled over `block` cells."""
-    height, width = pooled.shape
-    wide = np.zeros_like(pooled)
-    for v in range(height):
-        for u in range(width):
-            best = pooled[v, u]
-            for k in range(1, times):
-                if u + k * block < width:
-                    best = max(best, pooled[v, u + k * block])
-            wide[v, u] = best
-    out = np.zeros_like(pooled)
-    for v in range(height):
-        for k in range(times):
-            if v + k * block < height:
-                for u in range(width):
-                    out[v, u] = max(out[v, u], wide[v + k * block, u])
-    return out
-
-
-@njit(cache=True, nogil=True)
 def search(
     fine: Any, pooled: Any, block: int, top: Any, top_block: int, x0: float, y0: float, resolution_m: float, px: Any,
     py: Any, guess: Any, window_m: float, turn_rad: float, turn_step_rad: float, apart_m: float, apart_rad: float,
-    floor_share: float, any_rival: bool, result: Any,
+    floor_share: float, any_rival: bool, least: float, result: Any,
 ) -> None:  # fmt: skip
     """Best pose of points (M,) around a guess (3,), and the best of those that lie apart from it.
 
     pooled, top: maxima over block and top_block cells, a multiple (the same raster if it is 1).  any_rival: the first
-    that reaches floor_share will do.
+    that reaches floor_share will do.  least: a best that scores less need not be found.
     result: (5,) x, y, yaw of the best, its score, and the score of the best that is apart_m or apart_rad away (0 if
     none reaches floor_share of the best's); scores are mean likelihoods in [0, 1].
     """
@@ -125,12 +105,14 @@ def search(
             for bx in range(-blocks, blocks + 1):
                 bounds[at] = score_at(top, cells_x[t], cells_y[t], bx * top_block, by * top_block)
                 at += 1
-    order = np.argsort(-bounds, kind="mergesort")
+    enough = int(least * 255.0 * count)
+    hopeful = np.flatnonzero(bounds >= floor_share * enough)
+    order = hopeful[np.argsort(-bounds[hopeful], kind="mergesort")]
     ratio = top_block // block
     # Wide blocks reach beyond the window by up to 3 m: what drift cannot explain must not be found there.
     most = math.ceil(window_m / resolution_m) if ratio > 1 else 2 * (blocks + 1) * top_block
-    best, best_t, best_x, best_y = -1, 0, 0, 0
-    for n in range(total):
+    best, best_t, best_x, best_y = enough - 1, turns, 0, 0
+    for n in range(len(order)):
         k = order[n]
         if bounds[k] <= best:
             break
@@ -147,10 +129,13 @@ def search(
                     score = score_at(fine, cells_x[t], cells_y[t], dx, dy)
                     if score > best:
                         best, best_t, best_x, best_y = score, t, dx, dy
+    if best < enough:
+        result[:] = 0.0
+        return
     second = int(floor_share * best)
     found = False
     apart_cells = apart_m / resolution_m
-    for n in range(total):
+    for n in range(len(order)):
         k = order[n]
         if bounds[k] <= second or (found and any_rival):
             break

@@ -345,8 +345,8 @@ class Work:
             reach_m = float(self._reach_m(np.array(drift)))
             rows = self._around(place, key, reach_m, 16)
             raster = raster_of(shot.views, rows, shot.poses[rows], window_m=drift)
-            spot = find_view(view, raster, here, window_m=drift, turn_rad=turn, doubtful_share=s.rival)
-            if spot is None or spot.score < s.score:
+            spot = find_view(view, raster, here, window_m=drift, turn_rad=turn, doubtful_share=s.rival, least=s.score)
+            if spot is None:
                 self._events["no_place_fits"] += 1
                 continue
             if spot.rival > s.rival:

@@ -122,7 +122,7 @@ def known_map(patch: GridPatch) -> KnownMap:
     return KnownMap(
         r, x0, y0, kind, room, nearest, surface,
         step * r, x0 - BLOCK * step * r, y0 - BLOCK * step * r,
-        fine, pool(fine, INNER), pool(fine, BLOCK), allowed, _blocks_with(allowed), digest_of(patch),
+        fine, pool(fine, INNER, 1), pool(fine, BLOCK, 1), allowed, _blocks_with(allowed), digest_of(patch),
     )  # fmt: skip
 
 

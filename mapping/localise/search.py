@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2, wrap_angle
-from mapping.kernels.localise_search import draw_points, pool, pool_again, search
+from mapping.kernels.localise_search import draw_points, pool, search
 from mapping.localise.views import View, ViewArrays
 
 F64 = NDArray[np.float64]
@@ -62,16 +62,18 @@ def raster_of(store: ViewArrays, rows: I64, poses: F64, *, window_m: float = 0.0
     x1, y1 = (float(v) + FARTHEST_M for v in poses[:, :2].max(axis=0))
     fine = np.zeros((math.ceil((y1 - y0) / RESOLUTION_M) + 1, math.ceil((x1 - x0) / RESOLUTION_M) + 1), dtype=np.uint8)
     draw_points(store.x, store.y, store.quality, store.rows(rows), poses, x0, y0, RESOLUTION_M, fine)
-    pooled = pool(fine, block)
+    pooled = pool(fine, block, 1)
     if not is_wide:
         return Raster(fine, pooled, block, pooled, block, x0, y0)
-    return Raster(fine, pooled, block, pool_again(pooled, block, WIDEST_BLOCK // block), WIDEST_BLOCK, x0, y0)
+    return Raster(fine, pooled, block, pool(pooled, WIDEST_BLOCK // block, block), WIDEST_BLOCK, x0, y0)
 
 
 def find_view(
-    view: View, raster: Raster, guess: Pose2, *, window_m: float, turn_rad: float, doubtful_share: float | None = None
-) -> Found | None:
-    """The place within window_m and turn_rad of a guess where a view fits best; None if it has too few points.
+    view: View, raster: Raster, guess: Pose2, *, window_m: float, turn_rad: float, doubtful_share: float | None = None,
+    least: float = 0.0,
+) -> Found | None:  # fmt: skip
+    """The place within window_m and turn_rad of a guess where a view fits best; None if it has too few points, or
+    scores less than `least` everywhere.
 
     doubtful_share: it is enough to know whether any rival reaches this share; much is saved where many do.
     """
@@ -85,7 +87,10 @@ def find_view(
     search(
         raster.fine, raster.pooled, raster.block, raster.top, raster.top_block, raster.x0_m, raster.y0_m, RESOLUTION_M,
         px, py, np.array([guess.x_m, guess.y_m, guess.yaw_rad]), window_m, turn_rad, TURN_STEP_RAD, APART_M, APART_RAD,
-        RIVAL_SHARE if doubtful_share is None else doubtful_share, doubtful_share is not None, result,
+        RIVAL_SHARE if doubtful_share is None else doubtful_share, doubtful_share is not None, least,
+        result,
     )  # fmt: skip
     x, y, yaw, score, rival = (float(v) for v in result)
+    if score < least:
+        return None
     return Found(Pose2(x, y, wrap_angle(yaw)), score, rival / score if score > 0.0 else 0.0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.kernels.localise_match import nearest_bin
-from mapping.kernels.localise_search import pool, pool_again
+from mapping.kernels.localise_search import pool
 from mapping.localise.scan_match import Reach, agreement, match_view, weakest_information
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.views import View, ViewStore, table_for, view_of
@@ -227,7 +227,7 @@ def test_blocks_do_not_hide_the_best(window_m: float) -> None:
 
 def test_maxima_over_wide_blocks_come_from_those_over_small_ones() -> None:
     fine = np.random.default_rng(2).integers(0, 255, (70, 90)).astype(np.uint8)
-    np.testing.assert_array_equal(pool_again(pool(fine, 8), 8, 4), pool(fine, 32))
+    np.testing.assert_array_equal(pool(pool(fine, 8, 1), 4, 8), pool(fine, 32, 1))
 
 
 def test_one_rival_is_enough_where_more_need_not_be_known() -> None:
