@@ -348,13 +348,25 @@ def undoing(items: Sequence[tuple[str, Reading]], made: Robot, told: list[Mappin
         yield item
 
 
+def short_sighted(driving: Drive, farthest_m: float) -> Drive:
+    """The same drive with a laser that hardly sees beyond the corridor, so that the way drifts."""
+    items = [
+        (source, replace(said, range_m=np.where(said.range_m < farthest_m, said.range_m, np.inf)))
+        if isinstance(said, ScanReading)
+        else (source, said)
+        for source, said in driving.items
+    ]
+    return replace(driving, items=tuple(items))
+
+
 def test_closures_that_are_undone_let_the_map_go_and_it_is_drawn_again() -> None:
     """Without its closures the loop does not meet itself, as odometry and matches alone leave it."""
-    driving, answers = drive("loop", 1.25), list[Mapping[str, Any]]()
+    driving, answers = short_sighted(drive("loop", 1.25), 2.5), list[Mapping[str, Any]]()
     made = robot(driving.truth(0))
     made.play(undoing(driving.items, made, answers, 0.93))
     told = answers[0]
-    whole = round_the_loop().localiser.slam
+    kept = driven(driving)
+    whole = kept.localiser.slam
     slam = made.localiser.slam
     assert len(told["undone"]) > 3
     assert told["closures"] == 0
@@ -363,7 +375,7 @@ def test_closures_that_are_undone_let_the_map_go_and_it_is_drawn_again() -> None
     gone = {(each["from"], each["to"]) for each in told["undone"]}
     assert not gone & {(each.start, each.to) for each in slam.closures}
     assert slam.epoch > told["epoch"]
-    assert made.fusion.counters()["map.redrawn"] > round_the_loop().fusion.counters()["map.redrawn"]
+    assert made.fusion.counters()["map.redrawn"] > kept.fusion.counters()["map.redrawn"]
     seen = made.subscriber
     assert seen.patch is not None
     assert seen.strays == 0

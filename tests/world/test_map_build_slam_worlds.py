@@ -183,7 +183,7 @@ def test_the_path_does_not_depend_on_the_worker_thread() -> None:
                 if rng.random() < 0.3:
                     work.run()  # what ran once runs the same again
                 pending = pool.submit(work.run)
-    assert alone.epoch > 0
+    assert slam.events["optimised"] > 0  # or the worker would have had nothing to say
     assert slam.trajectory()[1].tobytes() == alone.trajectory()[1].tobytes()
 
 
