@@ -24,6 +24,7 @@ _HEALTH_PERIOD_NS = SECOND
 _FIRST_HEALTH_NS = 300_000_000
 _HEALTH_GAP_NS = SECOND // 10  # between two reports, however much changes
 _ASK_LIMIT_S = 10.0
+_ASK_LOOK_S = 0.2
 
 T = TypeVar("T")
 
@@ -99,8 +100,12 @@ class Worker:
             return work()
         asked = _Asked(work)
         self._queue.put("", asked)
-        if not asked.done.wait(_ASK_LIMIT_S):
-            raise Trouble(f"the fusion thread did not answer within {_ASK_LIMIT_S:.0f} s; see its log")
+        end_ns = self._now_ns() + round(_ASK_LIMIT_S * SECOND)
+        while not asked.done.wait(_ASK_LOOK_S):
+            if not self._thread.is_alive() and not asked.done.is_set():  # it ended without having looked again
+                asked.run()
+            elif self._now_ns() >= end_ns:
+                raise Trouble(f"the fusion thread did not answer within {_ASK_LIMIT_S:.0f} s; see its log")
         if asked.error is not None:
             raise asked.error
         return asked.result  # type: ignore[return-value]

@@ -122,6 +122,29 @@ def test_others_ask_between_readings_and_get_results_and_errors() -> None:
     assert worker.ask(lambda: 7) == 7  # after the thread has ended the maps belong to whoever asks
 
 
+def test_who_asks_as_the_thread_ends_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that is late in its last turn never looks at its queue again."""
+    office = Office()
+    late, go_on = threading.Event(), threading.Event()
+
+    def slow(_source: str, _item: object, _now_ns: int) -> list[Output]:
+        late.set()
+        assert go_on.wait(10.0)
+        return []
+
+    monkeypatch.setattr(office.fusion, "stream", slow)
+    office.worker.start()
+    office.worker.sink("front", scan(SECOND))
+    assert late.wait(10.0)
+    assert not office.worker.stop(0.0)
+    office.worker.turn(0.0)  # the last turn has taken what there was
+    threading.Timer(0.1, go_on.set).start()
+    asked = []
+    monkeypatch.setattr(office.worker, "turn", lambda _timeout_s: asked.append("turned"))
+    assert office.worker.ask(lambda: 7) == 7
+    assert asked == ["turned"]
+
+
 def test_a_flood_is_bounded_and_counted_but_events_survive(monkeypatch: pytest.MonkeyPatch) -> None:
     office = Office()
     office.worker.sink("front", DeviceEvent(0, LinkState.SILENT, "silent"))
