@@ -197,25 +197,30 @@ def thin_sectors(bearing: Any, distance: Any, range_max: float, gap_max: float, 
 
 
 @njit(cache=True)
-def in_star(points: Any, x: float, y: float, yaw: float, lo: Any, hi: Any, length: Any, anywhere: bool) -> Any:
-    """(N,) which of (N, 2) points lie in a star about the sensor at x, y, yaw: within the chord of a thin sector.
+def point_in_star(px: float, py: float, first: float, lo: Any, hi: Any, length: Any, anywhere: bool) -> bool:
+    """Whether a point, seen from the sensor, lies in a star: within the chord of a thin sector.
 
-    lo, hi, length: (M,) ascending, apart.  anywhere: in the direction of a thin sector, at any distance.
+    lo, hi, length: (M,) ascending, apart, M > 0.  first: lo[0] - EDGE_RAD.  anywhere: in the direction of a thin
+    sector, at any distance.
     """
-    count = len(lo)
+    along = (math.atan2(py, px) - first) % TWO_PI + first
+    at = max(np.searchsorted(lo, along + EDGE_RAD, side="right") - 1, 0)
+    if along > hi[at] + EDGE_RAD:
+        return False
+    return anywhere or math.hypot(px, py) <= length[at] * math.cos(0.5 * (hi[at] - lo[at]))
+
+
+@njit(cache=True)
+def in_star(points: Any, x: float, y: float, yaw: float, lo: Any, hi: Any, length: Any, anywhere: bool) -> Any:
+    """(N,) which of (N, 2) points lie in a star about the sensor at x, y, yaw; see point_in_star."""
     inside = np.zeros(len(points), dtype=np.bool_)
-    if count == 0:
+    if len(lo) == 0:
         return inside
     cos, sin = math.cos(yaw), math.sin(yaw)
     first = lo[0] - EDGE_RAD
     for k in range(len(points)):
         dx, dy = points[k, 0] - x, points[k, 1] - y
-        px, py = cos * dx + sin * dy, cos * dy - sin * dx
-        along = (math.atan2(py, px) - first) % TWO_PI + first
-        at = max(np.searchsorted(lo, along + EDGE_RAD, side="right") - 1, 0)
-        if along > hi[at] + EDGE_RAD:
-            continue
-        inside[k] = anywhere or math.hypot(px, py) <= length[at] * math.cos(0.5 * (hi[at] - lo[at]))
+        inside[k] = point_in_star(cos * dx + sin * dy, cos * dy - sin * dx, first, lo, hi, length, anywhere)
     return inside
 
 
@@ -544,6 +549,83 @@ def between(start: float, step: float, low: float, high: float) -> tuple[float, 
     if t0 > t1:
         t0, t1 = t1, t0
     return max(t0, 0.0), min(t1, 1.0)
+
+
+@njit(cache=True)
+def cells_crossed(
+    line: Any, x0: float, y0: float, edge: float, rows: int, cols: int, polygon: Any, reach: float
+) -> Any:
+    """(rows, cols) through which cells of a raster the closed polyline (M, 2) passes outside the vehicle's outline."""
+    crossed = np.zeros((rows, cols), dtype=np.bool_)
+    slack = 1e-9
+    for k in range(len(line)):
+        after = k + 1 if k + 1 < len(line) else 0
+        ax, ay, bx, by = line[k, 0] - x0, line[k, 1] - y0, line[after, 0] - x0, line[after, 1] - y0
+        ex, ey = bx - ax, by - ay
+        if ex == 0.0 and ey == 0.0:
+            continue
+        row_lo = max(0, math.floor((min(ay, by) - slack) / edge))
+        row_hi = min(rows - 1, math.floor((max(ay, by) + slack) / edge))
+        for row in range(row_lo, row_hi + 1):
+            t0, t1 = between(ay, ey, row * edge - slack, (row + 1) * edge + slack)
+            if t0 > t1:
+                continue
+            xa, xb = ax + t0 * ex, ax + t1 * ex
+            col_lo = max(0, math.floor((min(xa, xb) - slack) / edge))
+            col_hi = min(cols - 1, math.floor((max(xa, xb) + slack) / edge))
+            for col in range(col_lo, col_hi + 1):
+                if crossed[row, col]:
+                    continue
+                u0, u1 = between(ax, ex, col * edge - slack, (col + 1) * edge + slack)
+                u0, u1 = max(u0, t0), min(u1, t1)
+                if u0 <= u1:
+                    px, py = ax + u0 * ex + x0, ay + u0 * ey + y0
+                    qx, qy = ax + u1 * ex + x0, ay + u1 * ey + y0
+                    crossed[row, col] = nearest_outside(px, py, qx, qy, polygon, reach) < math.inf
+    return crossed
+
+
+@njit(cache=True)
+def free_cells(
+    lo: Any, hi: Any, length: Any, x: float, y: float, yaw: float,
+    x0: float, y0: float, edge: float, rows: int, cols: int, polygon: Any, reach: float,
+    corner_exempt: Any, middle_exempt: Any, under_vehicle: Any, far: Any,
+) -> Any:  # fmt: skip
+    """(rows * cols,) of cells that lie in a star as a whole (but for what the vehicle covers) their `far`, else 0.
+
+    lo, hi, length: the star of a sensor at x, y, yaw.  Exempt: (rows + 1) * (cols + 1) corners, and middles, that need
+    not be seen. Where no border passes, a cell is inside or outside as a whole, and its corners tell which.
+    """
+    free = np.zeros(rows * cols)
+    if len(lo) == 0:
+        return free
+    crossed = cells_crossed(star_border(lo, hi, length, x, y, yaw), x0, y0, edge, rows, cols, polygon, reach)
+    seen = np.zeros(len(corner_exempt), dtype=np.int8)  # of corners: 0 not looked at yet, 1 in the star, -1 not
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    first = lo[0] - EDGE_RAD
+    for row in range(rows):
+        for col in range(cols):
+            cell = row * cols + col
+            if crossed[row, col] or under_vehicle[cell]:
+                continue
+            whole = True
+            for corner in range(5):
+                if corner < 4:
+                    at_row, at_col = row + corner // 2, col + corner % 2
+                    at = at_row * (cols + 1) + at_col
+                    if seen[at] == 0:
+                        dx, dy = x0 + at_col * edge - x, y0 + at_row * edge - y
+                        own = point_in_star(cos * dx + sin * dy, cos * dy - sin * dx, first, lo, hi, length, False)
+                        seen[at] = 1 if own or corner_exempt[at] else -1
+                    whole = seen[at] > 0
+                elif not middle_exempt[cell]:
+                    dx, dy = x0 + (col + 0.5) * edge - x, y0 + (row + 0.5) * edge - y
+                    whole = point_in_star(cos * dx + sin * dy, cos * dy - sin * dx, first, lo, hi, length, False)
+                if not whole:
+                    break
+            if whole:
+                free[cell] = far[cell]
+    return free
 
 
 @njit(cache=True)

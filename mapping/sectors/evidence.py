@@ -73,6 +73,47 @@ class Verdict:
     source: I16
 
 
+class _Table:
+    """Findings as the kernel takes them: a row for each channel's in force, then one for what each still holds from
+    earlier ones. Only what has changed since the last time is written."""
+
+    def __init__(self, channels: int, count: int) -> None:
+        shape = (2 * channels, count)
+        self._obstacle, self._u, self._v, self._free = (np.zeros(shape) for _ in range(4))
+        self._blind, self._fresh = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+        self._stamp, self._source = np.zeros(shape, dtype=np.int64), np.zeros(shape[0], dtype=np.int64)
+        self._findings: list[Finding | None] = [None] * channels
+        self._stamps = [-1] * channels
+        self._freshness = [False] * channels
+
+    def columns(
+        self, channels: list[_Channel], now_ns: int, limits: tuple[int, ...]
+    ) -> tuple[F64, F64, F64, F64, Bool, I64, Bool, I64]:
+        """Obstacle, u, v, free, blind, stamp, fresh (F, N) and source (F,) of as many channels as it was made for."""
+        rows = len(channels)
+        for row, c in enumerate(channels):
+            found = c.finding
+            if self._findings[row] is not found:
+                self._findings[row] = found
+                self._obstacle[row], self._u[row], self._v[row] = found.obstacle_m, found.u, found.v
+                self._free[row], self._blind[row], self._source[row] = found.free_m, found.blind, c.source
+            if self._stamps[row] != c.stamp_ns:
+                self._stamp[row] = self._stamps[row] = c.stamp_ns
+            if self._freshness[row] == c.dead:
+                self._fresh[row] = self._freshness[row] = not c.dead
+        for c in channels:
+            if c.holds and np.isfinite(c.held_m).any():
+                self._obstacle[rows], self._u[rows], self._v[rows] = c.held_m, c.held_u, c.held_v
+                self._free[rows], self._blind[rows], self._source[rows] = 0.0, False, c.source
+                self._stamp[rows] = c.held_stamp_ns
+                self._fresh[rows] = ~c.held_dead & (now_ns - c.held_stamp_ns <= limits[c.source])
+                rows += 1
+        return (
+            self._obstacle[:rows], self._u[:rows], self._v[:rows], self._free[:rows], self._blind[:rows],
+            self._stamp[:rows], self._fresh[:rows], self._source[:rows],
+        )  # fmt: skip
+
+
 class Evidence:
     """The newest findings of every source and channel about the sectors of one map.
 
@@ -90,7 +131,8 @@ class Evidence:
         self.sources = sources
         self._count = count
         self._limits = limits
-        self._channels: dict[tuple[int, int], _Channel] = {}
+        self._channels: dict[tuple[int, int], _Channel] = {}  # in order of their keys; they only become more
+        self._table = _Table(0, count)
         self._touched: dict[tuple[int, int], Finding] = {}  # of switches: what each would say if it were tripped
         self._heard = [not wait_for_sources] * len(sources)
         self._nothing_held = (
@@ -129,6 +171,9 @@ class Evidence:
             )
             _hold(new, old, looked)
         self._channels[at, channel] = new
+        if old is None:
+            self._channels = dict(sorted(self._channels.items()))
+            self._table = _Table(len(self._channels), self._count)
 
     def nothing_heard(self, source: str, channel: int, finding: Finding, *, stamp_ns: int) -> None:
         """An invalid reading: what the channel said before stays and ages; a first one only says where it is blind."""
@@ -179,34 +224,8 @@ class Evidence:
         return self._judge(now_ns)
 
     def _judge(self, now_ns: int) -> Verdict:
-        obstacle, u, v, free, stamp, fresh, source, blind = self._table(now_ns)
-        return Verdict(
-            *kernels.judge(obstacle, u, v, free, blind, stamp, fresh, source, all(self._heard), now_ns, _STATES)
-        )
-
-    def _table(self, now_ns: int) -> tuple[F64, F64, F64, F64, I64, Bool, I64, Bool]:
-        # One row for each finding in force, then one for what each channel still holds from earlier ones.
-        channels = [self._channels[key] for key in sorted(self._channels)]
-        holding = [c for c in channels if c.holds and np.isfinite(c.held_m).any()]
-        shape = (len(channels) + len(holding), self._count)
-        obstacle, u, v, free = np.empty(shape), np.empty(shape), np.empty(shape), np.zeros(shape)
-        blind, fresh = np.zeros(shape, dtype=bool), np.empty(shape, dtype=bool)
-        stamp = np.empty(shape, dtype=np.int64)
-        for row, c in enumerate(channels):
-            found = c.finding
-            obstacle[row], u[row], v[row], free[row], blind[row] = (
-                found.obstacle_m,
-                found.u,
-                found.v,
-                found.free_m,
-                found.blind,
-            )
-            stamp[row], fresh[row] = c.stamp_ns, not c.dead
-        for row, c in enumerate(holding, start=len(channels)):
-            obstacle[row], u[row], v[row], stamp[row] = c.held_m, c.held_u, c.held_v, c.held_stamp_ns
-            fresh[row] = ~c.held_dead & (now_ns - c.held_stamp_ns <= self._limits[c.source])
-        source = np.array([c.source for c in channels] + [c.source for c in holding])
-        return obstacle, u, v, free, stamp, fresh, source, blind
+        columns = self._table.columns(list(self._channels.values()), now_ns, self._limits)
+        return Verdict(*kernels.judge(*columns, all(self._heard), now_ns, _STATES))
 
 
 def _hold(new: _Channel, old: _Channel, looked: Looked) -> None:

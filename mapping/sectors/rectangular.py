@@ -195,20 +195,16 @@ class _Raster:
         self._reach_m = float(np.hypot(self._body[:, 0], self._body[:, 1]).max()) if len(self._body) else 0.0
         x, y = np.meshgrid(x_edges_m, y_edges_m)
         middle_x, middle_y = np.meshgrid(0.5 * (x_edges_m[:-1] + x_edges_m[1:]), 0.5 * (y_edges_m[:-1] + y_edges_m[1:]))
-        self._corners = np.stack((x.ravel(), y.ravel()), axis=-1)
+        corners = np.stack((x.ravel(), y.ravel()), axis=-1)
         self._middles = np.stack((middle_x.ravel(), middle_y.ravel()), axis=-1)
-        corner_body, middle_body = outline.contains(self._corners), outline.contains(self._middles)
+        corner_body, middle_body = outline.contains(corners), outline.contains(self._middles)
         self._corner_exempt, self._middle_exempt = corner_body, middle_body
-        corners = self._around(corner_body)
-        self._under_vehicle = middle_body & corners.all(axis=0)
+        c = corner_body.reshape(self._rows + 1, self._cols + 1)
+        covered = c[:-1, :-1] & c[:-1, 1:] & c[1:, :-1] & c[1:, 1:]  # all four corners
+        self._under_vehicle = middle_body & covered.ravel()
         away_m = np.hypot(x, y).reshape(self._rows + 1, self._cols + 1)
         far_m = [away_m[:-1, :-1], away_m[:-1, 1:], away_m[1:, :-1], away_m[1:, 1:]]
         self._far_m = np.asarray(np.max(far_m, axis=0), dtype=np.float64).ravel()
-
-    def _around(self, of_corners: Bool) -> Bool:
-        # (4, N): the four corners of every square.
-        c = of_corners.reshape(self._rows + 1, self._cols + 1)
-        return np.stack((c[:-1, :-1].ravel(), c[:-1, 1:].ravel(), c[1:, :-1].ravel(), c[1:, 1:].ravel()))
 
     def nearest(self, points: F64) -> tuple[F64, F64, F64]:
         """(N,) distance, x, y of the nearest of (M, 2) points in each square."""
@@ -226,17 +222,13 @@ class _Raster:
 
     def free(self, sight: Sight) -> F64:
         """(N,) the far corner's distance where all of a square outside the vehicle was seen, 0 for the others."""
-        border = sight.border()
-        if len(border) == 0:
-            return np.zeros(self._rows * self._cols)
-        closed = np.ascontiguousarray(np.vstack((border, border[:1])))
-        crossing = kernels.line_through_cells(
-            closed, self._x0, self._y0, self._edge, self._rows, self._cols, self._body, self._reach_m
-        )[0].ravel()
-        # Where no border passes, the square is inside or outside as a whole, and its corners tell which.
-        seen_corners = self._around(sight.contains(self._corners) | self._corner_exempt)
-        seen = seen_corners.all(axis=0) & (sight.contains(self._middles) | self._middle_exempt)
-        return np.where(np.isinf(crossing) & seen & ~self._under_vehicle, self._far_m, 0.0)
+        pose = sight.virtual_from_sensor
+        free: F64 = kernels.free_cells(
+            sight.lo_rad, sight.hi_rad, sight.length_m, pose.x_m, pose.y_m, pose.yaw_rad,
+            self._x0, self._y0, self._edge, self._rows, self._cols, self._body, self._reach_m,
+            self._corner_exempt, self._middle_exempt, self._under_vehicle, self._far_m,
+        )  # fmt: skip
+        return free
 
     def covered_by_cone(self, cone_rad: float, range_max_m: float, virtual_from_transducer: Pose2) -> Bool:
         """(N,) squares whose middle lies in a cone, or through which its far end passes."""

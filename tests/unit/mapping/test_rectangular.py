@@ -6,10 +6,15 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mapping.frames import IDENTITY, Pose2
-from mapping.sectors.rectangular import RectSectors
+from mapping.kernels import sectors as kernels
+from mapping.sectors.footprint import Outline
+from mapping.sectors.rectangular import RectSectors, _Raster
+from mapping.sectors.sight import sight_of_beams
 from mapping.sectors.snapshot import RectSnapshot, SectorState
 
 F64 = NDArray[np.float64]
@@ -158,3 +163,39 @@ def test_an_obstacle_stays_where_the_next_scan_is_blind() -> None:
 def test_impossible_rasters_are_refused(size: tuple[float, float], edge: float) -> None:
     with pytest.raises(ValueError):
         RectSectors(sources=("laser",), size_m=size, sector_m=edge)
+
+
+@given(
+    st.integers(1, 60),
+    st.floats(-0.6, 0.6),
+    st.floats(-3.2, 3.2),
+    st.integers(0, 10_000),
+)
+@settings(max_examples=150, deadline=None)
+def test_free_squares_are_those_no_border_passes_and_whose_corners_are_seen(
+    beams: int, x_m: float, yaw_rad: float, seed: int
+) -> None:
+    """Square by square, from the star's border and its inside alone."""
+    rng = np.random.default_rng(seed)
+    bearing = np.sort(rng.uniform(-3.0, 3.0, beams))
+    sight = sight_of_beams(
+        bearing, rng.choice([0.0, 0.4, 1.0, 2.5, math.inf], beams) * rng.uniform(0.5, 1.0), range_max_m=3.0,
+        spacing_rad=0.1, virtual_from_sensor=Pose2(x_m, 0.1, yaw_rad),
+    )  # fmt: skip
+    edges = np.linspace(-1.0, 1.0, 9)
+    outline = Outline([[0.3, 0.2], [-0.4, 0.2], [-0.4, -0.2], [0.3, -0.2]], Pose2())
+    free = _Raster(edges, edges, 0.25, outline).free(sight).reshape(8, 8)
+    border = sight.border()
+    passes = np.zeros((8, 8), dtype=bool)
+    if len(border):
+        closed = np.ascontiguousarray(np.vstack((border, border[:1])))
+        reach = float(np.hypot(outline.polygon[:, 0], outline.polygon[:, 1]).max())
+        passes = np.isfinite(kernels.line_through_cells(closed, -1.0, -1.0, 0.25, 8, 8, outline.polygon, reach)[0])
+    for row in range(8):
+        for col in range(8):
+            corners = np.array([[edges[col + i], edges[row + j]] for j in (0, 1) for i in (0, 1)])
+            points = np.vstack((corners, corners.mean(axis=0)))
+            covered = outline.contains(points)
+            whole = bool((sight.contains(points) | covered).all()) and not covered.all() and not passes[row, col]
+            assert (free[row, col] > 0.0) == whole
+            assert free[row, col] in (0.0, pytest.approx(np.hypot(corners[:, 0], corners[:, 1]).max()))
