@@ -38,6 +38,7 @@ from service.log_lines import line_map_of
 from service.map_export import LINES, lines_layer
 from service.map_import import write_grid_map
 from service.recording_log import read_any_log
+from service.resident import give_back_heap
 
 F64 = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -105,6 +106,7 @@ def build(
     scans = log.scans[::every]
     if not scans:
         raise WrongUsage(f"{path}: holds no laser scan")
+    give_back_heap()  # what was read line by line
     read = time.monotonic()
     slam: dict[str, object] | None = None
     if poses is PoseSource.SLAM:

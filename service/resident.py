@@ -34,6 +34,15 @@ def give_back_code(least_bytes: int = _LEAST_BYTES) -> int:
     return given
 
 
+def give_back_heap() -> None:
+    """Return freed memory to the system, where the C library can; else nothing happens."""
+    try:
+        trim = ctypes.CDLL(None).malloc_trim
+    except (OSError, AttributeError):
+        return
+    trim(0)
+
+
 def _code_of_files(lines: list[str]) -> list[tuple[int, int, dict[str, int]]]:
     """Private executable mappings of files: start, stop, and their figures in kB."""
     found: list[tuple[int, int, dict[str, int]]] = []

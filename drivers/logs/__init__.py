@@ -26,7 +26,7 @@ from drivers.logs.log import (
     Provenance,
     Ticks,
     WheelGeometry,
-    read_bytes,
+    read_head,
 )
 from drivers.logs.tinyslam import looks_like_tinyslam, read_tinyslam
 from drivers.logs.ual_car import looks_like_ual_car, read_ual_car
@@ -55,8 +55,7 @@ def read_log(path: str | Path, *, no_echo_m: float | None = None, poses: PoseKin
     are taken for (CARMEN only).  Raises LogError naming the file and what was expected.
     """
     path = Path(path)
-    raw, _ = read_bytes(path)
-    head = raw[:HEAD_CHARACTERS].decode("utf-8", errors="replace")
+    head = read_head(path, HEAD_CHARACTERS)
     if looks_like_ual_car(head):
         return read_ual_car(path)
     if looks_like_tinyslam(head):

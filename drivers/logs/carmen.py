@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -36,7 +36,7 @@ from drivers.logs.log import (
     no_echo_threshold,
     odometry_from,
     path_of,
-    read_bytes,
+    read_lines,
     timed,
     without_echo_from,
     without_fillers,
@@ -73,8 +73,8 @@ def read_carmen(path: Path, *, no_echo_m: float | None = None, poses: PoseKind |
     are; None takes them as corrected if a particle filter's NEFF lines stand in the log or its name says "corrected".
     Raises LogError if the file cannot be read or holds no scan.
     """
-    raw, provenance = read_bytes(path)
-    found = _gather(raw.decode("utf-8", errors="replace"))
+    lines, provenance = read_lines(path)
+    found = _gather(lines)
     if not found.scans:
         raise LogError(f"{path}: no laser scan in it (skipped: {dict(found.skipped) or 'nothing'})")
     measured = without_fillers(_principal_laser(found))
@@ -96,9 +96,9 @@ def read_carmen(path: Path, *, no_echo_m: float | None = None, poses: PoseKind |
     )
 
 
-def _gather(text: str) -> _Gathered:
+def _gather(lines: Iterable[str]) -> _Gathered:
     found = _Gathered()
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(lines, 1):
         fields = line.split()
         if not fields:
             continue

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import io
+import zlib
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -132,19 +135,47 @@ class Log:
         return self.scans[-1].stamp_s - self.scans[0].stamp_s if self.scans else 0.0
 
 
-def read_bytes(path: Path) -> tuple[bytes, Provenance]:
-    """The content of a file, unpacked if it is gzip (by its first bytes, not its name), and where it came from."""
+def read_head(path: Path, characters: int) -> str:
+    """The beginning of a file's text, unpacked if it is gzip."""
+    raw, _ = _packed(path)
+    with _damage_told(path):
+        return _text(raw).read(characters)
+
+
+def read_lines(path: Path) -> tuple[Iterator[str], Provenance]:
+    """The lines of a file, unpacked on the way if it is gzip (by its first bytes, not its name), and where it is from.
+
+    A log of an hour has tens of megabytes of text: no more of it than a line is kept.
+    """
+    raw, provenance = _packed(path)
+    return _lines(path, raw), provenance
+
+
+def _packed(path: Path) -> tuple[bytes, Provenance]:
     try:
         raw = path.read_bytes()
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
     digest = hashlib.sha256(raw).hexdigest()
-    provenance = Provenance(path=str(path), dialect="", file_bytes=len(raw), sha256=digest)
-    if raw[:2] != b"\x1f\x8b":
-        return raw, provenance
+    return raw, Provenance(path=str(path), dialect="", file_bytes=len(raw), sha256=digest)
+
+
+def _lines(path: Path, raw: bytes) -> Iterator[str]:
+    with _damage_told(path):
+        yield from _text(raw)
+
+
+def _text(raw: bytes) -> io.TextIOWrapper:
+    packed = io.BytesIO(raw)
+    is_gzip = raw[:2] == b"\x1f\x8b"
+    return io.TextIOWrapper(gzip.GzipFile(fileobj=packed) if is_gzip else packed, encoding="utf-8", errors="replace")
+
+
+@contextmanager
+def _damage_told(path: Path) -> Iterator[None]:
     try:
-        return gzip.decompress(raw), provenance
-    except (OSError, EOFError, ValueError) as error:
+        yield
+    except (OSError, EOFError, zlib.error) as error:
         raise LogError(f"{path}: damaged gzip file ({error}); fetch it again") from error
 
 
@@ -202,34 +233,35 @@ def no_echo_threshold(scans: Sequence[F64], declared_max_m: float | None = None)
     cm), few or many; a declared maximum range counts too.
     """
     scans = [np.asarray(s, dtype=np.float64) for s in scans]
-    beams = np.concatenate([np.arange(len(s)) for s in scans]) if scans else np.zeros(0, dtype=np.int64)
-    readings = np.concatenate(scans) if scans else np.zeros(0)
-    real = np.isfinite(readings) & (readings > 0.0)
-    readings, beams = readings[real], beams[real]
+    real = [np.flatnonzero(np.isfinite(s) & (s > 0.0)) for s in scans]
+    readings = sum(map(len, real))
+    largest = max((float(s[at].max()) for s, at in zip(scans, real) if len(at)), default=0.0)
     candidates = [81.825]
     if declared_max_m is not None and declared_max_m > 0.0:
         candidates.append(declared_max_m - 0.005)
-    if len(readings) and readings.max() >= SHORTEST_LIMIT_M:
-        candidates.extend(_needles(readings, beams))
+    if largest >= SHORTEST_LIMIT_M:
+        far = [at[s[at] >= 0.97 * largest - 0.1] for s, at in zip(scans, real)]
+        last_beam = max(int(at[-1]) for at in real if len(at))
+        far_m = np.concatenate([s[at] for s, at in zip(scans, far)])
+        candidates.extend(_needles(far_m, np.concatenate(far), largest, readings, last_beam))
     threshold = min(candidates)
-    return threshold if np.any(readings >= threshold) else np.inf
+    return threshold if readings and largest >= threshold else np.inf
 
 
-def _needles(readings: F64, beams: NDArray[np.int64]) -> list[float]:
-    largest = float(readings.max())
-    far = readings >= 0.97 * largest - 0.1
-    bins = np.rint(readings[far] * 100.0).astype(np.int64)
+def _needles(far_m: F64, beams: NDArray[np.intp], largest: float, readings: int, last_beam: int) -> list[float]:
+    """far_m, beams: (M,) readings near the largest and which beam said each, of so many readings in all."""
+    bins = np.rint(far_m * 100.0).astype(np.int64)
     first = int(bins.min())
     count = np.bincount(bins - first)
-    fluke = max(10, len(readings) // 10000)
-    wide = max(3, (int(beams.max()) + 1) // 30)
+    fluke = max(10, readings // 10000)
+    wide = max(3, (last_beam + 1) // 30)
     found = []
     for k in np.flatnonzero(count >= fluke):
         near = int(count[max(0, k - 1) : k + 2].sum())
         around = int(count[max(0, k - 10) : k + 11].sum()) - near
-        everywhere = len(np.unique(beams[far][bins == first + k])) >= wide
+        everywhere = len(np.unique(beams[bins == first + k])) >= wide
         at_end = first + k >= 97.0 * largest
-        if at_end and near >= 3 * around and everywhere and count[k] < 0.95 * len(readings):
+        if at_end and near >= 3 * around and everywhere and count[k] < 0.95 * readings:
             found.append((first + int(k)) / 100.0 - 0.005)
     return found
 
@@ -263,8 +295,9 @@ def _fillers(scans: Sequence[LogScan], *, shortest_log: int = 50) -> dict[int, l
     for beams, rows in groups.items():
         if len(rows) < shortest_log:
             continue
-        table = np.stack(rows)
-        same = np.all(table == table[0], axis=0) & (table[0] >= 0.9 * largest)
+        same = rows[0] >= 0.9 * largest
+        for row in rows:
+            same &= row == rows[0]
         if same.mean() < 0.1:  # a few dead beams; a sensor looking into the void is another matter
             found[beams] = [int(i) for i in np.flatnonzero(same)]
     return found

@@ -28,7 +28,7 @@ from drivers.logs.log import (
     WheelGeometry,
     compose,
     dead_reckoning,
-    read_bytes,
+    read_lines,
 )
 
 FIRST_RANGE, LAST_RANGE = 24, 706
@@ -47,11 +47,11 @@ def looks_like_tinyslam(head: str) -> bool:
 
 def read_tinyslam(path: Path) -> Log:
     """A tinySLAM log. Raises LogError if the file cannot be read or holds no whole row."""
-    raw, provenance = read_bytes(path)
+    text, provenance = read_lines(path)
     skipped: Counter[str] = Counter()
     rows: list[F64] = []
     lines: list[int] = []
-    for number, line in enumerate(raw.decode("utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(text, 1):
         fields = line.split()
         if len(fields) < LAST_RANGE:
             skipped["short_row"] += bool(fields)

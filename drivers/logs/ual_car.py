@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from drivers.logs.log import (
     PoseKind,
     Ticks,
     WheelGeometry,
-    read_bytes,
+    read_lines,
 )
 
 M_PER_TICK = 0.00012910
@@ -43,11 +44,11 @@ def looks_like_ual_car(head: str) -> bool:
 def read_ual_car(path: Path) -> Log:
     """The log that either file of the pair belongs to. Raises LogError if one is missing or empty."""
     encoder_path, scan_path = _pair(path)
-    raw_encoders, _ = read_bytes(encoder_path)
-    raw_scans, provenance = read_bytes(scan_path)
+    encoder_text, _ = read_lines(encoder_path)
+    scan_text, provenance = read_lines(scan_path)
     skipped: Counter[str] = Counter()
-    encoders = _numbers(raw_encoders, 8, skipped, "bad_encoder_row")[1]
-    scan_lines, scan_rows = _numbers(raw_scans, None, skipped, "bad_scan_row")
+    encoders = _numbers(encoder_text, 8, skipped, "bad_encoder_row")[1]
+    scan_lines, scan_rows = _numbers(scan_text, None, skipped, "bad_scan_row")
     if not len(encoders) or not len(scan_rows):
         raise LogError(f"{path}: no usable rows in {encoder_path.name} or {scan_path.name}")
     order = np.argsort(encoders[:, 0], kind="stable")
@@ -94,13 +95,13 @@ def _pair(path: Path) -> tuple[Path, Path]:
     raise LogError(f"{path}: expected NAME.encoders.csv or NAME.scans.csv")
 
 
-def _numbers(raw: bytes, columns: int | None, skipped: Counter[str], reason: str) -> tuple[list[int], F64]:
+def _numbers(text: Iterable[str], columns: int | None, skipped: Counter[str], reason: str) -> tuple[list[int], F64]:
     """Rows of numbers below the header, with their line numbers; rows of another width are skipped and counted."""
     lines: list[int] = []
     rows: list[list[float]] = []
     width = columns
-    for number, line in enumerate(raw.decode("utf-8", errors="replace").splitlines()[1:], 2):
-        if not line.strip():
+    for number, line in enumerate(text, 1):
+        if number == 1 or not line.strip():
             continue
         try:
             row = [float(v) for v in line.split(",")]

@@ -26,7 +26,7 @@ from drivers.logs.log import (
     no_echo_threshold,
     odometry_from,
     path_of,
-    read_bytes,
+    read_lines,
     timed,
     without_echo_from,
     without_fillers,
@@ -41,11 +41,11 @@ def looks_like_wean(head: str) -> bool:
 
 def read_wean(path: Path, *, no_echo_m: float | None = None) -> Log:
     """A Wean Hall log in metres. Raises LogError if the file cannot be read or holds no scan."""
-    raw, provenance = read_bytes(path)
+    lines, provenance = read_lines(path)
     scans: list[LogScan] = []
     odometry: list[tuple[float, ...]] = []
     skipped: Counter[str] = Counter()
-    for number, line in enumerate(raw.decode("utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(lines, 1):
         fields = line.split()
         if not fields:
             continue

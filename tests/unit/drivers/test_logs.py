@@ -6,6 +6,7 @@ import gzip
 import math
 import os
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -229,6 +230,32 @@ def test_missing_and_damaged_files_are_told(tmp_path: Path) -> None:
     cut.write_bytes(gzip.compress(flaser([1.0] * 50, 1.0).encode())[:-20])
     with pytest.raises(LogError, match="damaged gzip"):
         read_log(cut)
+
+
+def test_damage_beyond_the_head_is_told(tmp_path: Path) -> None:
+    """The dialect is known from the first lines; the rest is unpacked as it is read."""
+    rng = np.random.default_rng(0)
+    text = "\n".join(flaser(rng.uniform(1.0, 8.0, 180).tolist(), float(k)) for k in range(400))
+    cut = tmp_path / "cut.log.gz"
+    cut.write_bytes(gzip.compress(text.encode())[:-1000])
+    with pytest.raises(LogError, match="damaged gzip"):
+        read_log(cut)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_reading_takes_little_more_memory_than_what_is_kept(tmp_path: Path, packed: bool) -> None:
+    """The text of Intel's 45 minutes, unpacked, split into lines and decoded, took four times what it says."""
+    rng = np.random.default_rng(0)
+    lines = [flaser(rng.uniform(1.0, 8.0, 180).tolist(), float(k)) for k in range(3000)]
+    path = written(tmp_path, *lines, packed=packed)
+    tracemalloc.start()
+    try:
+        log = read_log(path)
+        kept, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(log.scans) == 3000
+    assert peak < 3.0 * kept + path.stat().st_size
 
 
 def test_wean_lines_are_centimetres(tmp_path: Path) -> None:
