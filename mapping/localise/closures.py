@@ -157,7 +157,8 @@ class Snapshot:
 class WorkResult:
     """What came of it. poses: (N, 3) of the snapshot's keys; closures: all that are accepted now, weight: (C,) of each.
 
-    covariance: (3, 3) of the last key's pose, first key exact.  events: how often what happened.
+    covariance: (3, 3) of the last key's pose, first key exact; None if nothing is new but the path.  events: how often
+    what happened.
     """
 
     poses: F64
@@ -166,7 +167,7 @@ class WorkResult:
     pending: tuple[Closure, ...]
     unoptimised: int
     next_number: int
-    covariance: F64
+    covariance: F64 | None
     events: dict[str, int]
 
 
@@ -219,8 +220,10 @@ class Work:
             weight = self._weights(poses, accepted)
         if shot.thorough:
             accepted, weight = self._without_refuted(accepted, weight)
-        edges = shot.path.joined(edges_of(accepted))
-        covariance = covariance_of(poses, edges, weight, len(poses) - 1)
+        covariance = None
+        if poses is not shot.poses or unoptimised or len(accepted) != len(shot.closures):
+            edges = shot.path.joined(edges_of(accepted))
+            covariance = covariance_of(poses, edges, weight, len(poses) - 1)
         numbered, number = _numbered(accepted, shot.next_number)
         return WorkResult(
             poses, numbered, weight[len(shot.path) :], self._kept(pending), unoptimised, number, covariance,

@@ -43,7 +43,8 @@ from mapping.localise.closures import (
     turned_information,
 )
 from mapping.localise.kept_places import KeptPlaces
-from mapping.localise.pose_graph import Edges, composed_poses
+from mapping.localise.key_path import KeyPath
+from mapping.localise.pose_graph import composed_poses
 from mapping.localise.scan_match import Match, Reach, agreement, match_view, weakest_information
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.views import BearingTable, View, ViewArrays, ViewStore, table_for, view_of
@@ -233,9 +234,8 @@ class Slam:
         self._poses: F64 = np.zeros((64, 3))  # map_from_sensor of key scans
         self._travel: F64 = np.zeros(64)
         self._base_from_sensor: list[Pose2] = []
-        self._sensor_from_base: list[tuple[float, float, float]] = []
         self._key_stamps: list[int] = []
-        self._path: list[tuple[Pose2, F64]] = []  # measured, information: key k to k + 1
+        self._path = KeyPath()
         self._pending: tuple[Closure, ...] = ()
         self._stamps: list[int] = []
         self._scan_key: list[int] = []
@@ -265,7 +265,7 @@ class Slam:
     def state(self) -> SlamState:
         """What is known, as of now; what is on probation is not."""
         n = len(self._views)
-        edges = self._path_edges()
+        edges = self._path.edges()
         mounts = np.array([_row(each) for each in self._base_from_sensor]).reshape(-1, 3)
         return SlamState(
             self._views.arrays(), self._poses[:n].copy(), self._travel[:n].copy(), mounts,
@@ -286,13 +286,13 @@ class Slam:
         room = max(64, n)
         self._poses, self._travel = np.zeros((room, 3)), np.zeros(room)
         self._poses[:n], self._travel[:n] = state.poses, state.travel_m
-        self._base_from_sensor = [Pose2(*row) for row in state.base_from_sensor.tolist()]
-        inverses = [each.inverse() for each in self._base_from_sensor]
-        self._sensor_from_base = [(p.x_m, p.y_m, p.yaw_rad) for p in inverses]
+        shared: dict[Pose2, Pose2] = {}
+        mounts = (Pose2(*row) for row in state.base_from_sensor.tolist())
+        self._base_from_sensor = [shared.setdefault(mount, mount) for mount in mounts]
         self._key_stamps = state.stamps.tolist()
         for row in np.flatnonzero(self._views.arrays().is_there()).tolist():
             self._may_go.update(self._places.add(row, "", state.poses[row], None))
-        self._path = [(Pose2(*z), w) for z, w in zip(state.path.tolist(), state.information)]
+        self._path = KeyPath(state.path, state.information)
         self.closures, self.closure_weight = state.closures, state.weight.copy()
         self.epoch, self._next_number, self._looked_at = state.epoch, state.next_number, n
 
@@ -506,15 +506,13 @@ class Slam:
         self._poses[key] = (pose.x_m, pose.y_m, pose.yaw_rad)
         self._sensors[sensor].last_key = key
         self._base_from_sensor.append(base_from_sensor)
-        sensor_from_base = base_from_sensor.inverse()
-        self._sensor_from_base.append((sensor_from_base.x_m, sensor_from_base.y_m, sensor_from_base.yaw_rad))
         self._key_stamps.append(stamp_ns)
         odom_from_sensor = None if odom is None else odom @ base_from_sensor
         if key > 0:
             before = self._key_pose(key - 1)
             measured = before.inverse() @ pose
             information = self._path_information(before, measured, match, odom_from_sensor)
-            self._path.append((measured, information))
+            self._path.append(measured, information)
             self._travel[key] = self._travel[key - 1] + math.hypot(measured.x_m, measured.y_m)
             self._key_covariance = compose_covariance(
                 before, self._key_covariance, measured, np.linalg.inv(information)
@@ -642,7 +640,8 @@ class Slam:
             self.epoch += 1
         self._pending, self.closures, self.closure_weight = result.pending, result.closures, result.weight
         self._unoptimised, self._next_number = result.unoptimised, result.next_number
-        self._key_covariance = self._grown(result.covariance, known - 1)
+        if result.covariance is not None:
+            self._key_covariance = self._grown(result.covariance, known - 1)
         self.events.update(result.events)
         self._outstanding = None
 
@@ -653,30 +652,20 @@ class Slam:
     def _grown(self, covariance: F64, key: int) -> F64:
         """Covariance of the newest key scan from that of an earlier one, along the path."""
         for k in range(key, len(self._views) - 1):
-            measured, information = self._path[k]
+            measured, information = self._path.step(k)
             covariance = compose_covariance(self._key_pose(k), covariance, measured, np.linalg.inv(information))
         return covariance
 
     def _snapshot(self, keys: tuple[int, ...], *, thorough: bool = False) -> Snapshot:
         n = len(self._views)
         return Snapshot(
-            self._views.arrays(), self._poses[:n].copy(), self._travel[:n].copy(), self._path_edges(), self.closures,
+            self._views.arrays(), self._poses[:n].copy(), self._travel[:n].copy(), self._path.edges(), self.closures,
             self._pending, keys, self._unoptimised, self._next_number, thorough,
         )  # fmt: skip
 
     def snapshot(self) -> Snapshot:
         """What is known, as a piece of work would see it."""
         return self._snapshot(())
-
-    def _path_edges(self) -> Edges:
-        n = len(self._path)
-        return Edges(
-            np.arange(n),
-            np.arange(1, n + 1),
-            np.array([(z.x_m, z.y_m, z.yaw_rad) for z, _ in self._path]).reshape(-1, 3),
-            np.array([w for _, w in self._path]).reshape(-1, 3, 3),
-            np.zeros(n, dtype=np.bool_),
-        )
 
     def finish(self, progress: Progress | None = None) -> None:
         """No scan will follow: do what work is left, here, then look again at every key scan and optimise until
@@ -793,7 +782,7 @@ class Slam:
 
     def path_between(self, first: int, last: int) -> list[tuple[Pose2, F64]]:
         """Measured motions between successive key scans, and their information (3, 3), from scan `first` to `last`."""
-        return self._path[self._scan_key[first] : self._scan_key[last]]
+        return [self._path.step(k) for k in range(self._scan_key[first], self._scan_key[last])]
 
     def key_stamps(self) -> tuple[int, ...]:
         """When key scans were taken."""
@@ -820,7 +809,9 @@ class Slam:
 
     def key_poses(self) -> F64:
         """(K, 3) base poses of key scans."""
-        return composed_poses(self._poses[: len(self._views)], np.array(self._sensor_from_base).reshape(-1, 3))
+        turned = {mount: mount.inverse() for mount in set(self._base_from_sensor)}
+        inverses = np.array([_row(turned[mount]) for mount in self._base_from_sensor]).reshape(-1, 3)
+        return composed_poses(self._poses[: len(self._views)], inverses)
 
 
 def nearest_keys(poses: F64, near: Pose2, within_m: float, most: int, there: Bools) -> I64:
