@@ -6,8 +6,9 @@
     ODOMETRY         PoseReading      frames of x forward, y right, z down are turned over: y and yaw change sign
     ATTITUDE         AttitudeReading  pitch and yaw change sign
 
-We send HEARTBEAT each second and, once an autopilot's heartbeat was heard, SET_MESSAGE_INTERVAL for what is wanted and
-does not come. Stamps are those of arrival, the frame's time on the wire taken off.
+We send HEARTBEAT each second and, once an autopilot's heartbeat was heard, SET_MESSAGE_INTERVAL for what is wanted:
+once, for an autopilot has rates of its own, and again for what does not come. Stamps are those of arrival, the frame's
+time on the wire taken off.
 
 Source: MAVLink common.xml; conventions in docs/devices/mavlink_in.md.
 """
@@ -181,6 +182,7 @@ class MavlinkConversation:
         self._running = False
         self._heartbeat_due_ns = now_ns
         self._request_due_ns = now_ns
+        self._asked: set[int] = set()  # messages that came after we had asked for them
         self._heard_ns: dict[int, int] = {}
         self._resets: int | None = None
         self._sensor_ns: dict[int, int] = {}  # when each sensor of distance was last heard
@@ -195,12 +197,11 @@ class MavlinkConversation:
             frames.append(self._encode(HEARTBEAT, values))
         if self._autopilot_heard and now_ns >= self._request_due_ns:
             self._request_due_ns = now_ns + _REQUEST_PERIOD_NS
-            missing = [
-                message
-                for message in sorted(self._wanted)
-                if now_ns - self._heard_ns.get(message, _LONG_AGO) > _SECOND_NS
-            ]
-            frames += [self._ask_for(message) for message in missing]
+            silent = {
+                message for message in self._wanted if now_ns - self._heard_ns.get(message, _LONG_AGO) > MOST_SILENCE_NS
+            }
+            frames += [self._ask_for(message) for message in sorted(silent | (self._wanted - self._asked))]
+            self._asked = self._wanted - silent
         return frames
 
     def receive(self, chunk: bytes, stamp_ns: int) -> Iterator[Reading]:

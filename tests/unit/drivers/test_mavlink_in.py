@@ -280,7 +280,8 @@ def test_only_one_system_is_listened_to_and_ground_stations_are_none() -> None:
     assert conversation.identity.model == "MAVLink system 7"
 
 
-def test_what_is_missing_is_asked_for_as_pymavlink_understands_it() -> None:
+def test_everything_is_asked_for_once_and_what_is_missing_again_as_pymavlink_understands_it() -> None:
+    """Once, though it comes: an autopilot's own rate is another, and how datagrams fall must not decide."""
     conversation = MavlinkConversation((AttitudeReading, WheelReading), rate_hz=25)
     conversation.connected(0)
     parser = peer()
@@ -291,10 +292,15 @@ def test_what_is_missing_is_asked_for_as_pymavlink_understands_it() -> None:
     autopilot = encode_v2(HEARTBEAT, (0, 10, 3, 0, 4, 3), sequence=0, system=7, component=1)
     said(autopilot + ways(0, 0), conversation)
     frames = [each for each in conversation.requests(1100 * MS) if isinstance(each, bytes)]
-    _, asked = parser.parse_buffer(b"".join(frames))
-    assert (asked.get_type(), asked.command, asked.param1) == ("COMMAND_LONG", 511, ATTITUDE)
-    assert asked.param2 == pytest.approx(40_000)
-    assert (asked.target_system, asked.target_component) == (7, 1)
+    _, *both = parser.parse_buffer(b"".join(frames))
+    for asked, message in zip(both, (ATTITUDE, WHEEL_DISTANCE), strict=True):
+        assert (asked.get_type(), asked.command, asked.param1) == ("COMMAND_LONG", 511, message)
+        assert asked.param2 == pytest.approx(40_000)
+        assert (asked.target_system, asked.target_component) == (7, 1)
+    list(conversation.receive(ways(1, 1), 3000 * MS))
+    frames = [each for each in conversation.requests(3101 * MS) if isinstance(each, bytes)]
+    _, again = parser.parse_buffer(b"".join(frames))
+    assert again.param1 == ATTITUDE
     assert conversation.identity is not None
     assert conversation.identity.vendor == "ArduPilot"
     conversation.requests(4000 * MS)
