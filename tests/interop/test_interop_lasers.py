@@ -1,9 +1,13 @@
 """Other people's laser drivers on the emulated lasers, over ptys and TCP, held against the room they stand in.
 
-Packages: pyrplidarsdk (the maker's SDK), rplidar-roboticia, pyrplidar, lds2d. Programs, if they are on the PATH:
+Packages: pyrplidarsdk (the maker's SDK), rplidar-roboticia or one of its heirs (rplidar-sharpattack, rplidar-mrumel,
+rplidar), adafruit-rplidar, pyrplidar, lds2d, hokuyolx, sick-scan-tcp. Programs, if they are on the PATH:
 lms2xx_simple_app and lms2xx_set_variant (sicktoolbox), ldlidar_stl_node (ldlidar_stl_sdk), ultra_simple (rplidar_sdk),
 sick_generic_caller (sick_scan_xd, built without ROS; its launch files in the folder named by SICK_SCAN_LAUNCH),
 rawlog-grabber and rawlog-edit (mrpt-apps), the C samples of urg_library in the folder named by URG_SAMPLES.
+
+And the other way round: other people's emulators under our drivers, urg_sim (urg_stamped) and SICK's own test server
+(SICK_TEST_SERVER names its test_server.py, in sick_scan_xd).
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import importlib.util
+import inspect
 import itertools
 import json
 import os
@@ -28,6 +33,11 @@ import numpy as np
 import pytest
 import serial
 
+from drivers.laser_hokuyo import HokuyoConversation
+from drivers.laser_sick_cola import SickColaConversation
+from drivers.ports import TcpPort
+from drivers.reader import SourceHealth, WireReader
+from drivers.readings import ScanReading
 from sim_devices.attach import Attachment, PtyLink, TcpLink
 from sim_devices.device import F64, ByteDevice, Mount
 from sim_devices.laser_hokuyo import PROFILES, HokuyoLaser
@@ -138,6 +148,24 @@ def test_roboticia_reads_standard_turns(tmp_path: Path) -> None:
             turns = list(itertools.islice(reader.iter_scans(), 4))
             _, angles, ranges_mm = zip(*turns[-1])
             assert len(angles) == pytest.approx(2000 / 7, rel=0.05)
+            assert mean_error_m(list(angles), [r * 1e-3 for r in ranges_mm]) < NOISE_M
+            if "scan_type" in inspect.signature(reader.iter_scans).parameters:  # the heirs of that library
+                reader.stop()
+                turns = list(itertools.islice(reader.iter_scans("express"), 4))
+                assert len(turns[-1]) == pytest.approx(4000 / 7, rel=0.05)
+        finally:
+            reader.stop()
+            reader.disconnect()
+
+
+@needs("adafruit_rplidar")
+@pytest.mark.usefixtures("no_modem_lines")
+def test_adafruits_library_reads_turns(tmp_path: Path) -> None:
+    with on_a_pty(RpLidar(Room()), tmp_path / "laser") as port:
+        reader = importlib.import_module("adafruit_rplidar").RPLidar(None, port)
+        try:
+            assert reader.health == ("Good", 0)
+            _, angles, ranges_mm = zip(*list(itertools.islice(reader.iter_scans(), 4))[-1])
             assert mean_error_m(list(angles), [r * 1e-3 for r in ranges_mm]) < NOISE_M
         finally:
             reader.stop()
@@ -352,6 +380,81 @@ def test_makers_driver_starts_a_scanner(profile: str, file: str) -> None:
     assert "sEA LMDscandata" in out
     assert "sFA" not in out
     assert link.counters.sent_bytes > 5 * (3374 if profile == "tim571" else 1100)
+
+
+@needs("sick_scan_tcp")
+@pytest.mark.parametrize(("profile", "count"), [("tim571", 811), ("lms111", 541)])
+def test_text_client_that_reads_once_has_a_whole_scan(profile: str, count: int) -> None:
+    """One `recv` for each question, whatever came by then: scanners give TCP whole telegrams."""
+    link = TcpLink(0)
+    loop = Attachment()
+    loop.add("laser", SickColaLaser(Room(), profile=COLA_PROFILES[profile]), link)
+    with loop:
+        time.sleep(1.5)
+        host: Any = importlib.import_module("sick_scan_tcp").SickScan("127.0.0.1", link.port)
+        angles, ranges_m = host.extract_telegram(host.scan())
+        host.set_start_stop_angle(0, 180)
+        _, half = host.extract_telegram(host.scan())
+        host.release()
+    assert (angles[0], angles[-1]) == pytest.approx((-45.0, 225.0), abs=0.05)
+    assert len(ranges_m) == count
+    assert ranges_m[count // 2] == pytest.approx(3.0, abs=0.1)
+    assert len(half) == pytest.approx(count * 2 / 3, abs=2)
+
+
+def scans_read_by(conversation: Any, port: int, seconds: float) -> tuple[list[ScanReading], SourceHealth]:
+    """What our driver reads on this TCP port."""
+    heard: list[ScanReading] = []
+    reader = WireReader(
+        "laser",
+        lambda: TcpPort("127.0.0.1", port, clock=time.monotonic_ns),
+        {"laser": conversation},
+        lambda _, item: heard.append(item) if isinstance(item, ScanReading) else None,
+        clock=time.monotonic_ns,
+    )
+    reader.start()
+    time.sleep(seconds)
+    told = reader.health().sources["laser"]
+    reader.stop()
+    return heard, told
+
+
+@needs_program("urg_sim")
+@pytest.mark.parametrize(("model", "product"), [("UTM", "UTM-30LX-EW"), ("UST", "UST-30LC"), ("UUST2", "UST-30LC")])
+def test_our_driver_reads_urg_sim(model: str, product: str) -> None:
+    """A simulator that times its clock and its scans as the devices do; it knows one port."""
+    simulator = subprocess.Popen(["urg_sim", model], stderr=subprocess.DEVNULL)
+    try:
+        time.sleep(3.0)  # it boots
+        heard, told = scans_read_by(HokuyoConversation(), 10940, 4.0)
+    finally:
+        simulator.kill()
+        simulator.wait()
+    assert told.identity is not None
+    assert told.identity.model == product
+    assert told.counters.drops == {}
+    assert len(heard) > 80
+    assert {len(scan.range_m) for scan in heard} == {1081}
+    steps_ms = np.diff([scan.stamp_ns for scan in heard]) * 1e-6
+    assert steps_ms.mean() == pytest.approx(25.05, abs=0.05)
+    assert steps_ms.std() < 1.0
+
+
+@pytest.mark.skipif(not os.environ.get("SICK_TEST_SERVER"), reason="needs SICK_TEST_SERVER")
+def test_our_driver_reads_sicks_test_server(tmp_path: Path) -> None:
+    """It answers some questions, starts when told to run, and sends the same scan of an LMS511 again and again."""
+    (tmp_path / "none").touch()  # of recorded scans: it then has one of its own
+    arguments = [f"--scandata_file={tmp_path / 'none'}", "--scandata_frequency=25", "--tcp_port=2113"]
+    server = subprocess.Popen([sys.executable, os.environ["SICK_TEST_SERVER"], *arguments], stdout=subprocess.DEVNULL)
+    try:
+        time.sleep(1.0)
+        heard, _ = scans_read_by(SickColaConversation(), 2113, 9.0)
+    finally:
+        server.kill()
+        server.wait()
+    assert len(heard) > 40
+    assert len(heard[-1].range_m) == 1141
+    assert heard[-1].range_m[570] == pytest.approx(0.913)
 
 
 @needs("hokuyolx")

@@ -1,5 +1,5 @@
 """Other people's MAVLink on the emulated autopilot: pymavlink's connections, on which most ground tools stand; mavsdk
-(4 or later), which asks for version, parameters and rates as ground stations do."""
+(4 or later), which asks for version, parameters and rates as ground stations do; dronekit2."""
 
 from __future__ import annotations
 
@@ -78,6 +78,24 @@ def test_messages_flow_both_ways(meeting: tuple[MavlinkAutopilot, Any]) -> None:
     assert near.current_distance == 100
     assert pilot.companion_ns is not None
     assert (pilot.accepted, pilot.refused) == (3, 0)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("dronekit") is None, reason="needs dronekit2")
+def test_dronekit_is_ready_with_all_that_it_waits_for(tmp_path: Path) -> None:
+    """Parameters, a first word of the GPS, mode, attitude: its usual way to connect waits for each of them."""
+    pilot = MavlinkAutopilot(Rolling(), line_rate_bps=57600, rangefinders=[Rangefinder(0, Mount())])
+    loop = Attachment()
+    loop.add("pilot", pilot, PtyLink(tmp_path / "pilot"))
+    with loop:
+        vehicle: Any = importlib.import_module("dronekit").connect(
+            str(tmp_path / "pilot"), baud=57600, wait_ready=True, timeout=20
+        )
+        try:
+            assert vehicle.parameters["PRX1_TYPE"] == 2.0
+            assert vehicle.gps_0.fix_type == 1
+            assert vehicle.mode.name == "MANUAL"
+        finally:
+            vehicle.close()
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mavsdk") is None, reason="needs mavsdk")

@@ -1,4 +1,8 @@
-"""Other people's drivers on the emulated wheel boards, over ptys: basicmicro, tcr-roboclaw, odrive-can, canopen."""
+"""Other people's drivers on the emulated wheel boards, over ptys: basicmicro, tcr-roboclaw, roboclaw, odrive-can and
+canopen.
+
+And the other way round: our drivers on the axes of odrive-can's mock and on nodes of durand.
+"""
 
 from __future__ import annotations
 
@@ -110,6 +114,23 @@ def test_tcr_roboclaw_reads(claw: str) -> None:
     assert board.ReadEncM1()[1] > 100
     assert board.ReadSpeedM1()[1] == pytest.approx(700, abs=3)
     assert board.ResetEncoders()
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("roboclaw") is None or importlib.util.find_spec("PyCRC") is None,
+    reason="needs roboclaw and pythoncrc",
+)
+def test_pyroboclaw_reads_all_that_it_knows_and_drives(claw: str) -> None:
+    """It never empties the port: an answer longer than it expects would shift all that follow."""
+    board: Any = importlib.import_module("roboclaw.roboclaw").RoboClaw(claw, 0x80)
+    assert board.read_batt_voltage("main") == 12.1
+    assert board.read_input_pin_modes() == ("Default", "Disabled", "Disabled")
+    assert board.read_voltages() == (12.1, 5.0)
+    assert board.read_max_speed(1) == 44000
+    board.set_speed(1, 600)
+    time.sleep(0.4)
+    assert 150 < board.read_encoder(1) < 600
+    board.stop_motor(1)
 
 
 @needs("odrive_can")
