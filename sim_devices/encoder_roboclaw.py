@@ -36,25 +36,32 @@ ACKNOWLEDGED = b"\xff"
 BUFFER_EMPTY = 0x80
 
 LEAST_BY_BYTE, MOST_BY_BYTE = (2, 26), (3, 27)  # limits of batteries: (V - 6) * 5, V * 5.12
-WIDE_PINS = "5B"  # 74 and 75 of newer firmware: CTRL1 and CTRL2 as well
 
 # What is only kept: command that writes -> (format, command that reads back, place in what that one returns).
 SETTINGS: dict[int, tuple[str, int, int]] = {
     2: ("B", 59, 0), 3: ("B", 59, 1), 14: ("B", 15, 0), 26: ("B", 60, 0), 27: ("B", 60, 1),
-    28: ("IIII", 55, 0), 29: ("IIII", 56, 0), 57: ("HHB", 59, 0), 58: ("HH", 60, 0),
-    61: ("7I", 63, 0), 62: ("7I", 64, 0), 68: ("II", 81, 0), 69: ("II", 81, 2), 70: ("H", 72, 0), 71: ("H", 72, 1),
+    28: ("IIII", 55, 0), 29: ("IIII", 56, 0), 57: ("HH", 59, 0), 58: ("HH", 60, 0),
+    61: ("7I", 63, 0), 62: ("7I", 64, 0), 68: ("I", 81, 0), 69: ("I", 81, 1), 70: ("H", 72, 0), 71: ("H", 72, 1),
     74: ("BBB", 75, 0), 76: ("BBHHHHHBBHHHHH", 77, 0), 92: ("B", 91, 0), 93: ("B", 91, 1), 98: ("H", 99, 0),
     105: ("I", 107, 0), 106: ("I", 107, 1), 109: ("HH", 110, 0), 112: ("HH", 113, 0), 115: ("BB", 116, 0),
     128: ("II", 130, 0), 129: ("II", 131, 0), 133: ("II", 135, 0), 134: ("II", 136, 0), 139: ("BBB", 140, 0),
-    148: ("BB", 149, 0), 160: ("BB", 161, 0), 201: ("B", 202, 0),
+    148: ("B", 149, 0), 160: ("BB", 161, 0), 201: ("B", 202, 0),
 }  # fmt: skip
 DEFAULTS: dict[int, tuple[str, list[int]]] = {
     15: ("B", [0]), 55: ("IIII", [0, 65536, 32768, 44000]), 56: ("IIII", [0, 65536, 32768, 44000]),
-    59: ("HHB", [60, 340, 0]), 60: ("HH", [60, 340]), 63: ("7I", [0] * 7), 64: ("7I", [0] * 7),
-    72: ("HH", [32767, 32767]), 75: ("BBB", [0] * 3), 77: ("BBHHHHHBBHHHHH", [0] * 14), 81: ("4I", [0] * 4),
+    59: ("HH", [60, 340]), 60: ("HH", [60, 340]), 63: ("7I", [0] * 7), 64: ("7I", [0] * 7),
+    72: ("HH", [32767, 32767]), 75: ("BBB", [0] * 3), 77: ("BBHHHHHBBHHHHH", [0] * 14), 81: ("II", [0] * 2),
     91: ("BB", [0, 0]), 99: ("H", [3]), 107: ("II", [0, 0]), 110: ("HH", [0, 0]), 113: ("HH", [0, 0]),
     116: ("BB", [0, 0]), 130: ("II", [0, 0]), 131: ("II", [0, 0]), 135: ("II", [1000, 0]), 136: ("II", [1000, 0]),
-    140: ("BBB", [0, 1, 2]), 149: ("BB", [0, 0]), 161: ("BB", [0, 0]), 202: ("B", [0]),
+    140: ("BBB", [0, 1, 2]), 149: ("B", [0]), 161: ("BB", [0, 0]), 202: ("B", [0]),
+}  # fmt: skip
+
+# What newer firmware has instead: limits that follow the battery, CTRL1 and CTRL2 as well, one mode a motor.
+NEW_SETTINGS: dict[int, tuple[str, int, int]] = {
+    57: ("HHB", 59, 0), 68: ("II", 81, 0), 69: ("II", 81, 2), 74: ("5B", 75, 0), 148: ("BB", 149, 0),
+}  # fmt: skip
+NEW_DEFAULTS: dict[int, tuple[str, list[int]]] = {
+    59: ("HHB", [60, 340, 0]), 75: ("5B", [0] * 5), 81: ("4I", [0] * 4), 149: ("BB", [0, 0]),
 }  # fmt: skip
 
 # Both motors by one 7-bit number, as "mixed": way ahead and turn, each kept until the next; sign, and whether about 64.
@@ -78,7 +85,7 @@ MOVES: dict[int, tuple[str, str, str]] = {
     119: ("1", "iB", "tb"), 120: ("2", "iB", "tb"), 121: ("12", "iiB", "ttb"),
     122: ("1", "IiB", "stb"), 123: ("2", "IiB", "stb"), 124: ("12", "IiIiB", "ststb"),
 }  # fmt: skip
-PLAIN_WRITES: dict[int, str] = {20: "", 22: "i", 23: "i", 80: "I", 94: "I", 95: "", 200: ""}
+PLAIN_WRITES: dict[int, str] = {20: "", 22: "i", 23: "i", 80: "", 94: "I", 95: "", 200: ""}  # 80 of new: a key
 READS = frozenset(
     {16, 17, 18, 19, 21, 24, 25, 30, 31, 47, 48, 49, 73, 78, 79, 82, 83, 90, 100, 101, 103, 108, 111, 114}
 )
@@ -118,7 +125,7 @@ class RoboClaw:
 
     m1, m2: left and right wheel as wired.  link: "usb" takes any line speed, "ttl" only baud_bps.
     main_v, logic_v: its batteries.  top_ticks_per_s: speed at 100 % duty.  wide_status: command 90 answers 32 bits (new
-    firmware) or 16.  wide_pins: 74 and 75 have five pins' modes (newer firmware) or three.  packet_gap_ns: pause that
+    firmware) or 16.  new_firmware: some settings have the longer forms of NEW_SETTINGS.  packet_gap_ns: pause that
     ends a packet.
     """
 
@@ -137,7 +144,7 @@ class RoboClaw:
         logic_v: float = 5.0,
         top_ticks_per_s: float = 44000.0,
         wide_status: bool = True,
-        wide_pins: bool = False,
+        new_firmware: bool = False,
         packet_gap_ns: int = PACKET_GAP_NS,
     ) -> None:
         if address not in ADDRESSES:
@@ -154,7 +161,9 @@ class RoboClaw:
         self._version = version.encode("ascii") + b"\0"
         self._top = top_ticks_per_s
         self._wide_status = wide_status
-        self._wide_pins = wide_pins
+        self._settings = SETTINGS | (NEW_SETTINGS if new_firmware else {})
+        self._defaults = DEFAULTS | (NEW_DEFAULTS if new_firmware else {})
+        self._writes = PLAIN_WRITES | ({80: "I"} if new_firmware else {})
         self._gap_ns = packet_gap_ns
         self._wire = PacedWire(baud_bps if link == "ttl" else 2_000_000)
         self._powered = False
@@ -217,9 +226,7 @@ class RoboClaw:
         self._wire.clear(now_ns)
 
     def _restore(self) -> None:
-        self._values = {command: (form, list(values)) for command, (form, values) in DEFAULTS.items()}
-        if self._wide_pins:
-            self._values[75] = (WIDE_PINS, [0] * 5)
+        self._values = {command: (form, list(values)) for command, (form, values) in self._defaults.items()}
 
     @property
     def _timeout_ns(self) -> int:
@@ -263,15 +270,13 @@ class RoboClaw:
         """The data that follow a command, as a struct format; None if nobody knows it."""
         if command in READS or command in self._values:
             return ""
-        if command == 74 and self._wide_pins:
-            return WIDE_PINS
-        if command in SETTINGS:
-            return SETTINGS[command][0]
+        if command in self._settings:
+            return self._settings[command][0]
         if command in MOVES:
             return MOVES[command][1]
         if command in MIXED:
             return "B"
-        return PLAIN_WRITES.get(command)
+        return self._writes.get(command)
 
     def _obey(self, packet: bytes, form: str, now_ns: int) -> None:
         command = packet[1]
@@ -349,8 +354,8 @@ class RoboClaw:
     # -- writing ------------------------------------------------------------------------------------------------------
 
     def _write(self, command: int, values: list[int], now_ns: int) -> None:
-        if command in SETTINGS:
-            _, read, place = SETTINGS[command]
+        if command in self._settings:
+            _, read, place = self._settings[command]
             if command in LEAST_BY_BYTE:
                 values = [60 + 2 * values[0]]
             elif command in MOST_BY_BYTE:

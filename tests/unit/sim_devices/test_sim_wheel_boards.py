@@ -282,20 +282,23 @@ def write_claw(board: RoboClaw, now_ns: int, *packet: int) -> str:
     return ask(board, (text + crc16_ccitt(text).to_bytes(2, "big")).hex(), now_ns)
 
 
-@pytest.mark.parametrize(("wide", "modes"), [(False, (1, 2, 3)), (True, (1, 2, 3, 4, 5))])
-def test_claw_has_modes_of_three_pins_or_of_five(wide: bool, modes: tuple[int, ...]) -> None:
-    board, _ = claw(wide_pins=wide)
+@pytest.mark.parametrize(("new", "modes"), [(False, (1, 2, 3)), (True, (1, 2, 3, 4, 5))])
+def test_claw_has_the_settings_of_its_firmware(new: bool, modes: tuple[int, ...]) -> None:
+    board, _ = claw(new_firmware=new)
+    limits, key = ((0, 120, 1, 44), ()) if not new else ((0, 120, 1, 44, 1), (0xE2, 0x2E, 0xAB, 0x7A))
+    assert write_claw(board, SECOND // 2, 0x80, 57, *limits) == "FF"
+    assert bytes.fromhex(ask(board, "803B", SECOND // 4 * 3))[:-2] == bytes(limits)
     assert write_claw(board, SECOND, 0x80, 74, *modes) == "FF"
     answer = bytes.fromhex(ask(board, "804B", 2 * SECOND))
     assert tuple(answer[:-2]) == modes
-    assert write_claw(board, 3 * SECOND, 0x80, 80, 0xE2, 0x2E, 0xAB, 0x7A) == "FF"  # as delivered
+    assert write_claw(board, 3 * SECOND, 0x80, 80, *key) == "FF"  # as delivered
     assert bytes.fromhex(ask(board, "804B", 4 * SECOND))[:-2] == bytes(len(modes))
 
 
 def test_claw_takes_limits_of_batteries_by_byte() -> None:
     board, _ = claw()
     assert [write_claw(board, k * SECOND, 0x80, 2 + k, value) for k, value in enumerate((30, 154))] == ["FF", "FF"]
-    assert struct.unpack(">HHB", bytes.fromhex(ask(board, "803B", 3 * SECOND))[:5])[:2] == (120, 301)
+    assert struct.unpack(">HH", bytes.fromhex(ask(board, "803B", 3 * SECOND))[:4]) == (120, 301)
 
 
 def test_claw_drives_and_turns_by_seven_bits() -> None:
