@@ -22,12 +22,14 @@ from numpy.typing import ArrayLike, NDArray
 from mapping.grids.evidence import FREE, OCCUPIED, PARTLY_FREE, UNKNOWN
 from mapping.grids.geometry import check_resolution
 from mapping.kernels import octree as kernels
+from mapping.kernels import octree_rays as rays
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 I32 = NDArray[np.int32]
 I8 = NDArray[np.int8]
 U8 = NDArray[np.uint8]
+U64 = NDArray[np.uint64]
 T = TypeVar("T", bound=np.generic)
 
 STEP: Final = 0.05  # log-odds of one step of a voxel
@@ -77,9 +79,7 @@ class BoxCount:
     occupied: int
 
 
-_DENSE_RAYS: Final = 20_000  # fewer are walked one by one
-_FAR_LAYERS: Final = 12  # shorter rays are walked as fast as they are sorted
-_STRIDE: Final = 23  # so many rays of a dense tile for one that is walked from the origin: no divisor of usual widths
+_LEAST: Final = 5  # rays that end in one voxel: fewer are walked one by one
 
 
 class _Marks:
@@ -88,22 +88,23 @@ class _Marks:
     def __init__(self, room: int) -> None:
         self.touched: I64 = np.zeros(room, dtype=np.int64)
         self.left: I32 = np.zeros(room, dtype=np.int32)
-        self.marks: U8 = np.zeros(room * kernels.BRICK_VOXELS, dtype=np.uint8)
-        self.shortcuts: I64 = np.full((kernels.SHORTCUTS, 2), -1, dtype=np.int64)
+        self.marks: U64 = np.zeros(room * rays.WORDS, dtype=np.uint64)
+        self.shortcuts: I64 = np.full((rays.SHORTCUTS, 2), -1, dtype=np.int64)
 
     def grow(self, room: int) -> None:
         self.touched, self.left = _longer(self.touched, room), _longer(self.left, room)
-        self.marks = _longer(self.marks, room * kernels.BRICK_VOXELS)
+        self.marks = _longer(self.marks, room * rays.WORDS)
 
-    def arrays(self) -> tuple[I64, I32, U8, I64]:
+    def arrays(self) -> tuple[I64, I32, U64, I64]:
         return self.touched, self.left, self.marks, self.shortcuts
 
 
 class Octree:
     """Voxels of resolution_m in a cube of 65,536 voxels an edge around the origin. Not for two threads at once.
 
-    max_bricks: bound of its memory, about 0.6 KB each; a furnished room at 5 cm takes 2,000. Rays that find no room
-    leave nothing behind (refused_rays counts them), so what they passed stays unknown.
+    max_bricks: bound of its memory, about 0.6 KB each; a furnished room at 5 cm takes 2,000. When it is reached, bricks
+    that are there learn on. A ray whose end finds no room leaves nothing behind, another ends before the first brick
+    that finds none, so what lies beyond stays unknown; refused_rays counts both.
     """
 
     def __init__(
@@ -174,55 +175,36 @@ class Octree:
 
     def _insert_rays(self, origin: F64, points: F64, range_max_m: float, hit: NDArray[np.bool_]) -> None:
         n = len(points)
-        end, kind, refused = np.empty((n, 3)), np.empty(n, dtype=np.uint8), np.zeros(n, dtype=np.uint8)
-        self.rejected_points += kernels.place_rays(origin, points, self.resolution_m, range_max_m, hit, end, kind)
-        marks = _Marks(self._touched_before)
+        cloud = (origin, points, self.resolution_m, range_max_m, hit)
+        marks, refused = _Marks(self._touched_before), np.zeros(n, dtype=np.uint8)
+        runs, groups = np.empty((n, 3), dtype=np.int32), np.empty(n, dtype=np.int64)
+        members, fans = np.empty((n, 2), dtype=np.int32), np.empty((n, 4), dtype=np.float32)
+        grouped = (runs, groups, members, fans)
+        table = np.full(1 << (2 * n - 1).bit_length(), -1, dtype=np.int32)
+        count = np.zeros(rays.COUNT_LENGTH, dtype=np.int64)
+        some, slope = np.empty(n, dtype=np.int32), np.empty((n, 2))
         keep = self._lowest - kernels.UNIFORM
-        skip = np.zeros(n, dtype=np.int32)
 
-        def walk(order: I64) -> None:
-            done, full = 0, False
-            while done < len(order):
-                done = kernels.mark_rays(
-                    done, order, skip, origin, self.resolution_m, end, kind, keep, full, *self._tree(),
-                    *marks.arrays(), self._path, refused,
-                )  # fmt: skip
-                full = done < len(order) and not self._grow(marks)
-
-        tiles = self._tiles(origin, end, kind)
-        if tiles is None:
-            walk(np.arange(n, dtype=np.int64))
-        else:
-            order, first, layers = tiles
-            some, rest = kernels.some_and_rest(order, first, _STRIDE)
-            walk(some)
-            kernels.marked_layers(
-                order, first, layers, origin, self.resolution_m, keep, self._nodes, self._mark_of, marks.marks,
-                self._path, skip,
-            )  # fmt: skip
-            walk(rest)
         done, full = 0, False
         while done < n:
-            done = kernels.mark_hits(done, end, kind, full, *self._tree(), *marks.arrays(), self._path, refused)
+            done = rays.mark_ends(
+                done, full, *cloud, *self._tree(), *marks.arrays(), *grouped, table, count, self._path, refused
+            )  # fmt: skip
             full = done < n and not self._grow(marks)
+        for first_only in (True, False):
+            done, full = 0, False
+            while done < count[rays.GROUPS]:
+                done = rays.mark_ways(
+                    done, full, first_only, _LEAST, *cloud, keep, *self._tree(), *marks.arrays(), *grouped, count,
+                    some, slope, self._path, refused,
+                )  # fmt: skip
+                full = done < count[rays.GROUPS] and not self._grow(marks)
+        self.rejected_points += int(count[rays.SAID_NOTHING])
         self.refused_rays += int(np.count_nonzero(refused))
         self._touched_before = max(64, int(1.25 * self._state[kernels.TOUCHED]))
-        kernels.settle(
+        rays.settle(
             self._hit, self._miss, self._lowest, self._highest, *self._tree(), marks.touched, marks.marks, self._path
         )
-
-    def _tiles(self, origin: F64, end: F64, kind: U8) -> tuple[I64, I64, I32] | None:
-        """Rays in the order of tiles, where those begin, and layers, as kernels have them; None if the cloud is not
-        from one place, or not dense enough for it."""
-        n = len(end)
-        if len(origin) > 1 or n < _DENSE_RAYS:
-            return None
-        tile, layers = np.empty(n, dtype=np.int32), np.zeros(n, dtype=np.int32)
-        kernels.tiles_of_rays(origin, self.resolution_m, end, kind, tile, layers)
-        order, first = kernels.order_of_tiles(tile)
-        used = np.count_nonzero(np.diff(first))
-        dense = len(order) >= kernels.TILE_LEAST * used and int(layers.sum()) >= _FAR_LAYERS * len(order)
-        return (order, first, layers) if dense else None
 
     def _tree(self) -> tuple[I32, I8, I32, I32, I32, I32, I64]:
         return (

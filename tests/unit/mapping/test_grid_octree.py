@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mapping.grids.evidence import FREE, OCCUPIED, PARTLY_FREE, UNKNOWN
 from mapping.grids.octree import HALF, HEADER, Octree, VoxelRules
-from mapping.kernels import octree as kernels
+from mapping.kernels import octree_rays as rays
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -184,12 +184,24 @@ def test_points_that_say_nothing_are_counted_and_change_nothing() -> None:
     assert octree.count_in((-5, -5, -5), (5, 5, 5)).unknown == 1000
 
 
-def test_a_full_tree_refuses_whole_rays_and_says_so() -> None:
+def test_a_full_tree_refuses_rays_and_says_so() -> None:
     octree = Octree(resolution_m=D, max_bricks=3)
-    octree.insert((0.05, 0.05, 0.05), [(0.3, 0.05, 0.05), (9.05, 0.05, 0.05), (-9.0, 0.3, 0.05)])
-    assert octree.refused_rays >= 2
+    octree.insert((0.05, 0.05, 0.05), [(0.3, 0.05, 0.05), (9.05, 0.05, 0.05), (-9.0, 0.3, 0.05), (0.05, 0.05, 9.0)])
+    assert octree.refused_rays == 3
     assert octree.bricks <= 3
-    assert octree.state_at([(5.0, 0.05, 0.05), (0.2, 0.05, 0.05)]).tolist() == [UNKNOWN, FREE]
+    at = [(5.0, 0.05, 0.05), (0.2, 0.05, 0.05), (0.05, 0.05, 9.0), (0.05, 0.05, 0.35)]
+    assert octree.state_at(at).tolist() == [UNKNOWN, FREE, UNKNOWN, UNKNOWN]
+
+
+def test_a_full_tree_learns_on_in_the_bricks_it_has() -> None:
+    octree = Octree(resolution_m=D, max_bricks=2)
+    octree.insert((0.05, 0.05, 0.05), [(0.45, 0.05, 0.05), (0.85, 0.05, 0.05)])
+    for _ in range(3):
+        octree.insert((0.05, 0.05, 0.05), [(0.65, 0.05, 0.05)])
+    assert octree.refused_rays == 0
+    assert octree.state_at([(0.45, 0.05, 0.05), (0.65, 0.05, 0.05), (0.85, 0.05, 0.05)]).tolist() == [
+        FREE, OCCUPIED, OCCUPIED,
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -431,16 +443,21 @@ def depth_image(columns: int, rows: int, origin: tuple[float, float, float], see
     return np.asarray(origin + (np.stack((np.ones_like(u), u, v), axis=-1) * depth[..., None]).reshape(-1, 3) @ turn.T)
 
 
+def walked_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapping.grids.octree._LEAST", 10**9)
+
+
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.013, -0.377, 0.21), (0.05, 0.05, 0.025)])
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("resolution_m", [0.05, 0.11])
 def test_a_dense_cloud_is_inserted_as_if_each_ray_was_walked(
     origin: tuple[float, float, float], seed: int, resolution_m: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Tiles of directions only save work: the same bytes, also on top of what is known and with a bound on ranges."""
+    """Groups of rays only save work: the same bytes, also on top of what is known and with a bound on ranges."""
     trees = []
-    for dense_rays in (20_000, 10**9):
-        monkeypatch.setattr("mapping.grids.octree._DENSE_RAYS", dense_rays)
+    for one_by_one in (False, True):
+        if one_by_one:
+            walked_one_by_one(monkeypatch)
         tree = Octree(resolution_m=resolution_m)
         for number, range_max_m in ((seed, math.inf), (seed + 2, 1.7), (seed, math.inf)):
             tree.insert(origin, depth_image(300, 200, origin, number), range_max_m=range_max_m)
@@ -449,16 +466,40 @@ def test_a_dense_cloud_is_inserted_as_if_each_ray_was_walked(
     assert trees[0].leaf_count() > 1000
 
 
-def test_most_rays_of_a_depth_image_begin_near_their_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else tiles save nothing."""
-    skipped: list[float] = []
-    walk = kernels.mark_rays
+@pytest.mark.parametrize("seed", range(12))
+def test_any_crowd_of_rays_is_inserted_as_if_each_was_walked(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clusters, planes, points on borders of voxels, near the sensor and along axes; some rays met nothing."""
+    rng = np.random.default_rng(seed)
+    origin = np.round(rng.normal(0.0, 1.0, 3), rng.integers(1, 4))
+    clusters = np.repeat(rng.normal(0.0, 2.0, (60, 3)), 30, axis=0) + rng.normal(0.0, 0.12, (1800, 3))
+    plane = rng.uniform(-3.0, 3.0, (2000, 3)) * (1.0, 1.0, 0.0) + (0.0, 0.0, float(rng.normal(0.0, 1.0)))
+    near = origin + rng.normal(0.0, 0.25, (500, 3))
+    borders = np.round(rng.normal(0.0, 1.0, (400, 3)), 1)
+    axes = origin + rng.uniform(-3.0, 3.0, (300, 1)) * np.eye(3)[rng.integers(0, 3, 300)]
+    points = np.concatenate((clusters, plane, near, borders, axes, [[np.nan, 0.0, 0.0]]))
+    points = points[rng.permutation(len(points))] if seed % 2 else points
+    is_hit = rng.random(len(points)) < (0.9 if seed % 3 else 0.1)
+    trees = []
+    for one_by_one in (False, True):
+        if one_by_one:
+            walked_one_by_one(monkeypatch)
+        tree = Octree(resolution_m=D)
+        for range_max_m in (math.inf, 2.3):
+            tree.insert(origin, points, range_max_m=range_max_m, is_hit=is_hit)
+        trees.append(tree)
+    assert trees[0].to_bytes() == trees[1].to_bytes()
 
-    def noted(begin: int, order: I64, skip: I64, *rest: Any) -> int:
-        skipped.append(float(np.mean(skip[order] >> 2)))
-        return int(walk(begin, order, skip, *rest))
 
-    monkeypatch.setattr(kernels, "mark_rays", noted)
+def test_few_rays_of_a_depth_image_are_walked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else groups save nothing."""
+    walked: list[int] = []
+    mark_ways = rays.mark_ways
+
+    def noted(*arguments: Any) -> int:
+        done = int(mark_ways(*arguments))
+        walked.append(int(arguments[-5][rays.WALKED]))
+        return done
+
+    monkeypatch.setattr(rays, "mark_ways", noted)
     Octree(resolution_m=0.05).insert((0.0, 0.0, 0.0), depth_image(640, 480, (0.0, 0.0, 0.0), 2))
-    assert skipped[0] == 0.0
-    assert skipped[-1] > 20.0  # of 30 to 42 layers
+    assert 0 < walked[-1] < 0.05 * 640 * 480
