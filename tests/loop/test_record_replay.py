@@ -149,24 +149,6 @@ def test_a_recording_from_the_first_byte_gives_the_map_that_was_made_live(robot:
     assert about["check"] == "ok"
     assert about["grid"]["occupied_cells"] > 200
 
-    # As a log, mapped offline: walls where they were live.
-    built = json.loads(robot.command("map", "build", str(path), "--out", f"{robot.folder}/built", "--json"))
-    assert built["slam"]["odometry"]
-    assert built["lines"] >= 1
-    lasers = 'grid.sources=["lasers.front"]'  # as the live map would be without sonars
-    robot.command("replay", str(path), "--set", lasers, "--out", f"{robot.folder}/lasers")
-    live, offline = (load_pgm_yaml(robot.folder / folder / "map.yaml") for folder in ("lasers", "built"))
-    walls, found = occupied_points(live), occupied_points(offline)
-    off_m = np.hypot(*(found[:, None, :] - walls[None, :, :]).transpose(2, 0, 1))
-    # Without the pulled cable it is 0.99 both ways; what came in a burst afterwards both place as well as they can.
-    assert np.mean(off_m.min(axis=0) < 0.08) > 0.5
-    assert np.mean(off_m.min(axis=1) < 0.08) > 0.5
-    assert (
-        len(read_any_log(path).scans)
-        == built["scans"]
-        == len((robot.folder / "built/trajectory.tum").open().readlines())
-    )
-
     # Cut anywhere, and with other settings, it is still a map, the same every time, and it says what it is not.
     data = path.read_bytes()
     cut = robot.folder / path.name
@@ -199,3 +181,20 @@ def test_a_running_daemon_records_on_request_and_its_replay_is_always_the_same(r
     assert reports[0].why_not == ["it began while the daemon was running: its first poses are not in it"]
     assert reports[0].readings > 100
     assert reports[0].sent_otherwise == 0
+    assert_mapped_offline_as_live(robot, Path(lines[0]))
+
+
+def assert_mapped_offline_as_live(robot: Robot, recording: Path) -> None:
+    """As a log, mapped offline, it has its walls where they were live."""
+    built = json.loads(robot.command("map", "build", str(recording), "--out", f"{robot.folder}/built", "--json"))
+    assert built["slam"]["odometry"]
+    assert built["lines"] >= 1
+    lasers = 'grid.sources=["lasers.front"]'  # as the live map would be without sonars
+    robot.command("replay", str(recording), "--set", lasers, "--out", f"{robot.folder}/lasers")
+    live, offline = (load_pgm_yaml(robot.folder / folder / "map.yaml") for folder in ("lasers", "built"))
+    walls, found = occupied_points(live), occupied_points(offline)
+    off_m = np.hypot(*(found[:, None, :] - walls[None, :, :]).transpose(2, 0, 1))
+    assert np.mean(off_m.min(axis=0) < 0.08) > 0.6  # 0.99 both ways on a machine that keeps up, 0.8 on a busy one
+    assert np.mean(off_m.min(axis=1) < 0.08) > 0.6
+    path = (robot.folder / "built/trajectory.tum").read_text().splitlines()
+    assert len(read_any_log(recording).scans) == built["scans"] == len(path)
