@@ -19,6 +19,20 @@ from service.topics import JSON_REPLY, RPC
 _LOG = logging.getLogger(__name__)
 _WAITING_MAX = 16
 _ARGUMENT_BYTES_MAX = 64 * 1024
+_A_MAP = "a map: [grid] with a laser or sonars, and [store] enabled"
+_NEEDS = {
+    "save_map": _A_MAP,
+    "load_map": _A_MAP,
+    "list_maps": _A_MAP,
+    "map_info": _A_MAP,
+    "plan": "[rooms] enabled and a grid",
+    "name_room": "[rooms] enabled and a grid",
+    "where_am_i": "[scenes] enabled and a laser",
+    "list_closures": "[slam] enabled and a laser",
+    "undo_closure": "[slam] enabled and a laser",
+    "relocalise": '[localise] mode = "map"',
+}
+"""What a daemon lacks that does not answer a call."""
 
 Handler = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
@@ -123,7 +137,9 @@ class Calls:
     def _call(self, name: str, payload: bytes) -> bytes:
         handler = self._handlers.get(name)
         if handler is None:
-            raise CallRefused(f"no call {name!r}; there are: {', '.join(self.names) or 'none'}")
+            need = _NEEDS.get(name)
+            why = f"no call {name!r}" if need is None else f"{name} needs {need}"
+            raise CallRefused(f"{why}; there are: {', '.join(self.names) or 'none'}")
         return json.dumps(dict(handler(_arguments(payload))), ensure_ascii=False).encode()
 
 

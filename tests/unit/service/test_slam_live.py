@@ -224,3 +224,12 @@ def test_what_fits_nothing_is_not_drawn_until_something_fits_again() -> None:
     assert any("nothing is drawn" in trouble for trouble in robot.localiser.troubles()) or counts["slam.scans"] < 25
     assert robot.look(here, here)
     assert robot.localiser.take_round("sonars", round_, here)
+
+
+def test_a_call_that_is_not_there_says_what_it_needs() -> None:
+    calls = Calls("robots/r")
+    calls.register("record_stop", lambda _: {})
+    with pytest.raises(CallRefused, match=r"save_map needs a map: \[grid\].*there are: record_stop"):
+        calls._call("save_map", b"")
+    with pytest.raises(CallRefused, match="no call 'dance'"):
+        calls._call("dance", b"")
