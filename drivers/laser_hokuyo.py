@@ -462,9 +462,9 @@ class HokuyoConversation:
                 f"laser trouble (BM status 01): power it off and on; if it stays, the unit needs service.{says}"
             )
             return False
-        if reply is None:
+        if reply is None:  # the stream switches it on as well
             self._trouble = "does not answer BM (laser on): check the power supply, it must carry the motor's start"
-        return reply is not None
+        return True
 
     def _start_stream(self) -> _Script:
         profile = self._profile
@@ -479,7 +479,8 @@ class HokuyoConversation:
             if reply is not None and reply.status in ("00", "99"):
                 return True
             self._stream = None
-            self._trouble = _trouble_of_refusal(request.command().decode(), None if reply is None else reply.status)
+            if reply is not None or self._trouble is None:
+                self._trouble = _trouble_of_refusal(request.command().decode(), None if reply is None else reply.status)
         return False
 
     def _request(self, symbol: str, profile: Profile) -> ScanRequest | None:

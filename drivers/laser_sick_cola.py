@@ -115,7 +115,7 @@ class SickColaConversation(ScriptedConversation[Telegram]):
                 yield pause(500 * _MS)
 
     def _find(self) -> Generator[Step[Telegram], Telegram | None, None]:
-        """Ask who it is, then how it is (some know that only), until anything in CoLa binary comes back."""
+        """Ask who it is, how it is, for scans (some know those only), until anything in CoLa binary comes back."""
         while True:
             heard_bytes = self._counters.bytes
             if (yield from self._answers(IDENTIFY)):
@@ -123,6 +123,9 @@ class SickColaConversation(ScriptedConversation[Telegram]):
             self._tell_silence(heard_bytes)
             if (yield from self._answers(ASK_STATE)):
                 yield from self._answers(IDENTIFY)
+                self._note_identity()
+                return
+            if (yield from self._answers(SUBSCRIBE)):
                 self._note_identity()
                 return
 

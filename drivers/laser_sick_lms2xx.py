@@ -158,8 +158,12 @@ class SickLms2xxConversation(ScriptedConversation[Telegram]):
         for _ in range(12):  # for as long as there is a sign of life at this speed
             heard = self._heard
             reply = yield from self._ask(STOP, _is(MODE), PROBE_NS)
-            if reply is not None and (yield from self._ask(ASK_STATUS, _is(STATUS), PROBE_NS)) is not None:
-                return True  # twice: a reply that was held up may come when another speed is tried already
+            if reply is not None:  # twice: a reply that was held up may come when another speed is tried already
+                again = yield from self._ask(ASK_STATUS, _is(STATUS), PROBE_NS)
+                if again is None:  # a unit that does not tell its status
+                    again = yield from self._ask(STOP, _is(MODE), PROBE_NS)
+                if again is not None:
+                    return True
             if self._heard == heard:
                 return False
         return False
@@ -252,8 +256,9 @@ class SickLms2xxConversation(ScriptedConversation[Telegram]):
         field_deg, step_cdeg = self._sweep.field_deg, round(100 * self._sweep.resolution_deg)
         wanted = struct.pack("<HH", field_deg, step_cdeg)
         reply = yield from self._ask_twice(encode_telegram(b"\x3b" + wanted), _is(VARIANT), MODE_NS)
-        if reply is None:
-            return self._fail("does not answer the choice of field and resolution")
+        if reply is None:  # scans of another field have another count of values, and are dropped
+            self._set_up_trouble = "does not answer the choice of field and resolution; scans are taken as they come"
+            return True
         if reply.command != VARIANT or reply.payload[1] != 1 or reply.payload[2:6] != wanted:
             return self._fail(
                 f"refuses a field of {field_deg} deg in steps of {self._sweep.resolution_deg} deg: "

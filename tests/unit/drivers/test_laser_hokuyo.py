@@ -78,6 +78,7 @@ class Peer:
     streaming: bytes = b""
     laser_trouble: bool = False
     has_time_mode: bool = True
+    mute_to: tuple[bytes, ...] = ()
     speaks_me: bool = True
     clock_offset_ms: float = 5_000.0  # device clock ahead of the host's
     drift: float = 0.0
@@ -122,6 +123,8 @@ class Peer:
             self.pending.append((at_ns + self.delay_ns, reply))
 
     def answer(self, command: bytes, now_ns: int) -> bytes:
+        if command[:2] in self.mute_to:
+            return b""
         if command == b"SCIP2.0":
             reply = b"SCIP2.0\n0\n\n" if self.scip1 else b"SCIP2.0\n0Ee\n\n"
             self.scip1 = False
@@ -484,6 +487,13 @@ def test_spin_up_takes_seconds() -> None:
     b.run_until_running()
     assert b.peer.received.count(b"QT") == 1
     assert b.conversation.counters.drops == {}
+
+
+def test_a_simple_device_that_knows_only_how_to_say_who_it_is_and_to_stream() -> None:
+    """Others' simulators, mostly: the stream switches the laser on as well as BM does."""
+    b = bench(Peer(mute_to=(b"BM", b"II", b"TM")))
+    b.run_until_running(8 * S)
+    assert b.conversation.trouble is None
 
 
 def test_laser_trouble_is_told_and_tried_again() -> None:

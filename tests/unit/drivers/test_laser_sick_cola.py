@@ -237,6 +237,7 @@ class Peer:
     measures: bool = True
     speaks_binary: bool = True
     knows_its_name: bool = True
+    knows_its_state: bool = True
     warms_up_ns: int = 0
     measures_from_ns: int = 1 << 62
     told: list[int] = field(default_factory=list)
@@ -259,7 +260,7 @@ class Peer:
         self.received.append(payload)
         if not self.speaks_binary:
             self.out.append((now_ns + MS, b"\x02sFA 1\x03"))
-        elif payload == b"sRN SCdevicestate":
+        elif payload == b"sRN SCdevicestate" and self.knows_its_state:
             self.tell(b"sRA SCdevicestate \x01", now_ns)
         elif payload == b"sRN DeviceIdent" and self.knows_its_name:
             self.tell(b"sRA DeviceIdent \x00\x07TiM551B\x00\x04V2.5", now_ns)
@@ -476,3 +477,11 @@ def test_a_broken_telegram_does_not_hold_up_the_reply_behind_it() -> None:
 
 def test_farewell() -> None:
     assert SickColaConversation().farewell() == [UNSUBSCRIBE]
+
+
+def test_a_simple_server_that_only_sends_scans() -> None:
+    d = desk(Peer(knows_its_name=False, knows_its_state=False))
+    d.run(4.0)
+    assert d.state is LinkState.RUNNING
+    assert len(d.readings) > 20
+    assert d.conversation.identity is not None

@@ -220,6 +220,7 @@ class Peer:
     variant: tuple[int, int] = (180, 100)
     nak_next: int = 0
     knows_type: bool = True
+    mute_to: bytes = b""  # commands
     refuse_38400: bool = False
     status: int = 0x10
     paced: bool = True
@@ -242,6 +243,8 @@ class Peer:
             self.send(b"\x15", now_ns)
             return
         self.received.append(item[4:-2])
+        if item[4] in self.mute_to:
+            return
         self.send(b"\x06", now_ns)
         self.answer(item[4:-2], now_ns)
 
@@ -569,3 +572,15 @@ def test_farewell_stops_the_stream() -> None:
 def test_wrong_arguments(arguments: dict[str, object]) -> None:
     with pytest.raises(ValueError):
         SickLms2xxConversation(**arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("variant", [(180, 50), (180, 100)])
+def test_a_simple_device_that_only_stops_and_streams(variant: tuple[int, int]) -> None:
+    """Others' simulators, mostly. Scans of another variant than the wanted one are dropped, not misread."""
+    desk = Desk(SickLms2xxConversation(), Peer(mute_to=b"\x31\x3a\x3b\x74", variant=variant))
+    desk.run(14.0)
+    fits = variant == (180, 50)
+    assert (desk.state is LinkState.RUNNING) == fits
+    assert bool(desk.readings) == fits
+    assert ("bad_count" in desk.conversation.counters.drops) == (not fits)
+    assert not fits or "field and resolution" in (desk.conversation.trouble or "")
