@@ -535,7 +535,13 @@ class Slam:
         information = np.diag([1.0 / sigma_m**2, 1.0 / sigma_m**2, 1.0 / sigma_rad**2])
         if match is not None:
             information = information + turned_information(match.information(), -before.yaw_rad)
+        else:
+            information = np.linalg.inv(np.linalg.inv(information) + self._unseen())
         return floored(information, s.floor_m, s.floor_rad)
+
+    def _unseen(self) -> F64:
+        """(3, 3) what may have happened beside odometry while nothing was matched: a slip, a push."""
+        return np.diag([0.05**2, 0.05**2, math.radians(3.0) ** 2]) * (1 + self._lost_scans)
 
     def _told_only(self, stamp_ns: int, map_from_base: Pose2, odom: Pose2 | None) -> SlamUpdate:
         """A scan that nothing can be done with: the prediction stands for it."""
@@ -566,7 +572,7 @@ class Slam:
             held = floored(turned_information(match.information(), -key_pose.yaw_rad), 0.005, math.radians(0.1))
             covariance = compose_covariance(key_pose, covariance, in_key, np.linalg.inv(held))
         elif match is None and key > 0:
-            covariance = covariance + np.diag([0.05**2, 0.05**2, math.radians(3.0) ** 2]) * (1 + self._lost_scans)
+            covariance = covariance + self._unseen()
         return SlamUpdate(stamp_ns, map_from_base, covariance, match is not None or key == 0, key, is_key, self.epoch)
 
     def _note_velocity(self, stamp_ns: int, map_from_base: Pose2, *, matched: bool) -> None:
