@@ -1,6 +1,6 @@
 """SLAM on recorded logs: error against relations, speed on one core, memory, and what each part is worth.
 
-    UMFELD_DATA=folder .venv/bin/python bench/slam.py [--logs intel fr079] [--ablation] [--json FILE]
+    UMFELD_DATA=folder .venv/bin/python bench/slam.py [--logs intel fr079] [--ablation] [--variants NAME ...] [--json F]
 
 Times are those of the thread on its core; the worst second is the slowest stretch of scans that took one.
 """
@@ -36,6 +36,7 @@ def variants() -> dict[str, SlamSettings]:
         "no closures": replace(whole, closures=replace(closures, apart_m=math.inf)),
         "searched closures only": replace(whole, closures=replace(closures, tracked_m=-1.0)),
         "no probation": replace(whole, closures=replace(closures, agreeing=1, agreeing_way_m=0.0)),
+        "whatever the way says": replace(whole, closures=replace(closures, surprise=math.inf, doubling=math.inf)),
         "single tests off": replace(
             whole, closures=replace(closures, explained=0.0, overlap=0.0, mean_cost=1.0, weakest_per_m2=0.0, rival=2.0)
         ),
@@ -83,6 +84,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--logs", nargs="+", default=list(LOGS), choices=list(LOGS))
     parser.add_argument("--ablation", action="store_true", help="also without each part")
+    parser.add_argument("--variants", nargs="+", choices=list(variants()), help="only these")
     parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args()
     data = Path(os.environ.get("UMFELD_DATA", ""))
@@ -92,6 +94,8 @@ def main() -> None:
         relations = data / f"{LOGS[name]}.relations.gz"
         run_slam(log, log.scans[:200])  # compiles
         for variant, settings in variants().items():
+            if variant not in (options.variants or variants()):
+                continue
             began = time.thread_time()
             run = run_slam(log, log.scans, settings=settings)
             row = {"variant": variant, **figures(name, log, run, time.thread_time() - began, relations)}
@@ -99,7 +103,7 @@ def main() -> None:
                 row["with_20_false_closures_m"] = round(without_injected(log, run, relations), 4)
             rows.append(row)
             print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
-            if not options.ablation:
+            if not options.ablation and options.variants is None:
                 break
     if options.json is not None:
         options.json.write_text(json.dumps(rows, indent=2) + "\n")
