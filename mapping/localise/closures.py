@@ -67,7 +67,8 @@ class ClosureSettings:
     surprise: squared Mahalanobis distance of a searched closure, by the covariance along the way, beyond which nothing
     explains it; held_m: steps less sure than that are held by the wheels alone, see Uncertainty.
     agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way,
-    groups of rough ones over rough_way_m; doubled for each `doubling` of surprise.
+    groups of rough ones over rough_way_m; as much again for each `doubling` of surprise beyond `expected`, which is
+    what nine of ten true ones stay below.
     pending: how many closures wait at most.  undone_below: the weight under which a closure is forgotten in the end.
     floor_*: errors of a match that no matcher sees.  misfit: median squared distance of new closures from the map that
     makes an optimisation due; so do optimise_every new ones.
@@ -101,7 +102,8 @@ class ClosureSettings:
     rough_worth: float = 0.34
     surprise: float = 12.0
     held_m: float = 0.0115
-    doubling: float = 4.0
+    expected: float = 6.25
+    doubling: float = 3.0
     agreeing: int = 3
     agreeing_way_m: float = 1.2
     rough_way_m: float = 6.0
@@ -442,7 +444,8 @@ class Work:
                 best, votes = group, sum(worth.values())
         if votes < s.agreeing:
             return [], pending
-        doubt = 1.0 + float(np.median([pending[k].surprise for k in best])) / s.doubling
+        surprise = float(np.median([pending[k].surprise for k in best]))
+        doubt = 1.0 + max(0.0, surprise - s.expected) / s.doubling
         way = [float(travel[pending[k].to]) for k in best]
         is_rough = sum(pending[k].worth >= 0.5 for k in best) < 2
         if votes < doubt * s.agreeing or max(way) - min(way) < doubt * (

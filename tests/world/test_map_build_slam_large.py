@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from bench.slam_large import HALLS, Case, drive, false_closures, pair_errors, pairs, simulated
+from bench.slam_large import ALIKE, HALLS, Case, drive, false_closures, pair_errors, pairs, recorded, simulated
 from mapping.frames import Pose2
 from mapping.scan import Scan
 
@@ -28,6 +29,32 @@ def test_a_loop_of_two_hundred_metres_is_closed_and_nothing_else() -> None:
     assert off_deg.max() < 1.5
     assert sum(closure.searched for closure in slam.closures) >= 3
     assert not false_closures(case, slam)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_corridors_that_all_look_alike_are_not_taken_for_each_other() -> None:
+    """Each is like the next but one, 15 m aside, which was seen before it: only the way there tells them apart."""
+    case = simulated("alike", ALIKE, 4)
+    slam = drive(case)
+    assert not false_closures(case, slam)
+    assert sum(closure.searched for closure in slam.closures) >= 10
+    off_m, off_deg = pair_errors(case, slam.trajectory()[1], pairs(case))
+    assert off_m.max() < 0.3
+    assert off_deg.max() < 1.5
+
+
+@pytest.mark.data
+@pytest.mark.timeout(120)
+@pytest.mark.skipif(not os.environ.get("UMFELD_DATA"), reason="needs UMFELD_DATA")
+def test_halls_seen_every_metre_are_closed() -> None:
+    """Its headings drift by 15 degrees and its few second visits are short: votes must not be asked for that true
+    closures, as far off as the covariance says they may be, cannot give."""
+    case = recorded("acapulco", 1, seed_of_wheels=1)
+    slam = drive(case)
+    assert not false_closures(case, slam)
+    off_m, _ = pair_errors(case, slam.trajectory()[1], pairs(case))
+    assert (off_m < 0.5).mean() > 0.9
 
 
 def test_pairs_are_visits_of_one_place_and_their_errors_are_relations() -> None:

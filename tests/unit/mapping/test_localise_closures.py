@@ -52,7 +52,7 @@ def test_so_many_votes_from_so_much_of_the_way_are_needed(
     assert (len(group), len(waiting)) == ((votes, 0) if are_enough else (0, votes))
 
 
-@pytest.mark.parametrize(("surprise", "are_enough"), [(0.5, True), (4.0, False), (11.0, False)])
+@pytest.mark.parametrize(("surprise", "are_enough"), [(0.5, True), (5.0, True), (9.0, False), (11.5, False)])
 def test_what_nobody_expected_needs_more_votes(surprise: float, are_enough: bool) -> None:
     judge, pending = work(5, 1.0)
     pending = [replace(c, surprise=surprise) for c in pending]
@@ -75,7 +75,7 @@ def test_what_the_way_cannot_explain_surprises() -> None:
     shot = Snapshot(ViewStore().arrays(), rows, 0.5 * np.arange(n + 1.0), path, (), (), (), 0, 0)
     judge = Work(shot, ClosureSettings())
     seen = np.diag([0.02**-2.0, 0.02**-2.0, math.radians(0.3) ** -2.0])
-    assert judge._surprise(Closure(0, n, Pose2(0.5, -0.6, 0.02), seen, 1.0, True)) < ClosureSettings().doubling
+    assert judge._surprise(Closure(0, n, Pose2(0.5, -0.6, 0.02), seen, 1.0, True)) < ClosureSettings().expected
     assert judge._surprise(Closure(0, n, Pose2(0.0, 5.0, 0.0), seen, 1.0, True)) > ClosureSettings().surprise
 
 
