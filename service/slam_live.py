@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
-from mapping.localise.closures import Closure, WorkResult
+from mapping.localise.closure_records import Closure, WorkResult
 from mapping.localise.placing import Placing
 from mapping.localise.slam import Slam, SlamSettings, SlamUpdate
 from mapping.localise.sweep_change import Depths, depths_of, is_changed

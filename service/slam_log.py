@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.logs import Log, LogScan
 from mapping.frames import Pose2, wrap_angles
-from mapping.localise.closures import WorkResult
+from mapping.localise.closure_records import WorkResult
 from mapping.localise.slam import Slam, SlamSettings, run_here
 from mapping.scan import Scan
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
-from mapping.localise.closures import Closure
+from mapping.localise.closure_records import Closure
 from mapping.localise.kept_sweeps import KeptSweep
 from mapping.localise.slam import SlamState
 from mapping.localise.views import View, ViewStore, table_of

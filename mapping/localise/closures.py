@@ -20,12 +20,22 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.localise.closure_records import (
+    Closure,
+    ClosureSettings,
+    Snapshot,
+    WorkResult,
+    edges_of,
+    floored,
+    turned_information,
+)
 from mapping.localise.pose_graph import (
     Edges,
     Solution,
@@ -45,145 +55,11 @@ from mapping.localise.scan_match import (
     weakest_information,
 )
 from mapping.localise.search import APART_M, APART_RAD, find_view, raster_of
-from mapping.localise.views import ViewArrays
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 REFINING = Reach((0.40, 0.28, 0.20, 0.15), (0.12, 0.08, 0.06, 0.04))
-
-
-@dataclass(frozen=True, slots=True)
-class ClosureSettings:
-    """What counts as seeing a place again. Lengths along the way are metres driven.
-
-    apart_m: the way between two visits.  drift_m, drift_share: how far off a key may be after a way through the graph:
-    the sum of both, at most search_m.  tracked_m: up to this drift no search is needed.  turn_rad_per_m: heading drift.
-    place_m: key scans on either side along the way that make up a place.  every_m: a place is searched for so
-    often, at most `searches` times in one piece of work.  score, rival: of a search, see Found.
-    explained, overlap, mean_cost: of the points, see Agreement and Match; half_*: what still has half a vote.
-    weakest_per_m2: least information in the worst direction.  rough_*: what still has rough_worth of a vote: outdoors
-    nothing is a plane and little holds a pose, but nearly all that was seen is seen again.
-    surprise: squared Mahalanobis distance of a searched closure, by the covariance along the way, beyond which nothing
-    explains it; held_m: steps less sure than that are held by the wheels alone, see Uncertainty.
-    agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way,
-    groups of rough ones over rough_way_m; as much again for each `doubling` of surprise beyond `expected`, which is
-    what nine of ten true ones stay below.
-    pending: how many closures wait at most.  undone_below: the weight under which a closure is forgotten in the end.
-    floor_*: errors of a match that no matcher sees.  misfit: median squared distance of new closures from the map that
-    makes an optimisation due; so do optimise_every new ones.
-    """
-
-    apart_m: float = 8.0
-    drift_m: float = 0.6
-    drift_share: float = 0.05
-    search_m: float = 40.0
-    tracked_m: float = 1.0
-    turn_start_rad: float = math.radians(6.0)
-    turn_rad_per_m: float = math.radians(0.15)
-    turn_most_rad: float = math.radians(30.0)
-    place_m: float = 2.5
-    places: int = 3
-    every_m: float = 0.8
-    searches: int = 6
-    score: float = 0.55
-    rival: float = 0.93
-    explained: float = 0.55
-    overlap: float = 0.93
-    mean_cost: float = 0.30
-    half_explained: float = 0.50
-    half_overlap: float = 0.88
-    half_mean_cost: float = 0.42
-    weakest_per_m2: float = 1000.0
-    rough_explained: float = 0.70
-    rough_overlap: float = 0.95
-    rough_mean_cost: float = 0.60
-    rough_weakest_per_m2: float = 250.0
-    rough_worth: float = 0.34
-    surprise: float = 12.0
-    held_m: float = 0.0115
-    expected: float = 6.25
-    doubling: float = 3.0
-    agreeing: int = 3
-    agreeing_way_m: float = 1.2
-    rough_way_m: float = 6.0
-    pending: int = 64
-    floor_m: float = 0.015
-    floor_rad: float = math.radians(0.15)
-    undone_below: float = 0.15
-    misfit: float = 30.0
-    optimise_every: int = 60
-
-
-@dataclass(frozen=True, slots=True)
-class Closure:
-    """Key `to` seen from key `start`, an earlier one.
-
-    information: (3, 3) in the frame of start.  worth: its vote on probation.  searched: found by search,
-    not from the estimate.  number: its name, for undoing; -1 until it is accepted.  surprise: squared Mahalanobis
-    distance from where the way led, when it was found.
-    """
-
-    start: int
-    to: int
-    measured: Pose2
-    information: F64
-    worth: float
-    searched: bool
-    number: int = -1
-    surprise: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """What a piece of work sees.
-
-    poses: (N, 3) of key scans in the map frame.  travel_m: (N,) way driven up to each.  path: edges between successive
-    key scans.  closures: accepted.  pending: on probation.  keys: those to look for closures of.  thorough: optimise
-    in any case, until nothing moves.
-    """
-
-    views: ViewArrays
-    poses: F64
-    travel_m: F64
-    path: Edges
-    closures: tuple[Closure, ...]
-    pending: tuple[Closure, ...]
-    keys: tuple[int, ...]
-    unoptimised: int
-    next_number: int
-    thorough: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class WorkResult:
-    """What came of it. poses: (N, 3) of the snapshot's keys; closures: all that are accepted now, weight: (C,) of each.
-
-    covariance: (3, 3) of the last key's pose, first key exact; None if nothing is new but the path.  events: how often
-    what happened.
-    """
-
-    poses: F64
-    closures: tuple[Closure, ...]
-    weight: F64
-    pending: tuple[Closure, ...]
-    unoptimised: int
-    next_number: int
-    covariance: F64 | None
-    events: dict[str, int]
-
-
-def edges_of(closures: tuple[Closure, ...] | list[Closure]) -> Edges:
-    """Closures as doubtful edges."""
-    if not closures:
-        return Edges.none()
-    return Edges(
-        np.array([c.start for c in closures], dtype=np.int64),
-        np.array([c.to for c in closures], dtype=np.int64),
-        np.array([(c.measured.x_m, c.measured.y_m, c.measured.yaw_rad) for c in closures]),
-        np.array([c.information for c in closures]),
-        np.ones(len(closures), dtype=np.bool_),
-    )
 
 
 @dataclass(slots=True)
@@ -194,6 +70,7 @@ class Work:
     settings: ClosureSettings
     _events: Counter[str] = field(default_factory=Counter)
     _uncertainty: Uncertainty | None = None
+    _known: Edges | None = None
 
     def run(self) -> WorkResult:
         """Look for closures of the snapshot's keys, judge what is pending, optimise if it is worth it."""
@@ -223,9 +100,8 @@ class Work:
         if shot.thorough:
             accepted, weight = self._without_refuted(accepted, weight)
         covariance = None
-        if poses is not shot.poses or unoptimised or len(accepted) != len(shot.closures):
-            edges = shot.path.joined(edges_of(accepted))
-            covariance = covariance_of(poses, edges, weight, len(poses) - 1)
+        if poses is not shot.poses:
+            covariance = covariance_of(poses, self._edges(accepted), weight, len(poses) - 1)
         numbered, number = _numbered(accepted, shot.next_number)
         return WorkResult(
             poses, numbered, weight[len(shot.path) :], self._kept(pending), unoptimised, number, covariance,
@@ -265,7 +141,7 @@ class Work:
         from scipy.sparse.csgraph import dijkstra
 
         shot = self.snapshot
-        edges = shot.path.joined(edges_of(shot.closures))
+        edges = self._edges(shot.closures)
         length = np.hypot(edges.measured[:, 0], edges.measured[:, 1]) + 1e-3
         order = np.lexsort((length, edges.to, edges.start))  # of parallel edges the shortest
         pair = edges.start[order] * len(shot.poses) + edges.to[order]
@@ -386,7 +262,7 @@ class Work:
         """Squared Mahalanobis distance of a closure from where the way through the graph leads."""
         shot = self.snapshot
         if self._uncertainty is None:
-            edges = shot.path.joined(edges_of(shot.closures))
+            edges = self._edges(shot.closures)
             self._uncertainty = Uncertainty(
                 shot.poses, edges, weights_of(shot.poses, edges), held_m=self.settings.held_m
             )
@@ -492,12 +368,22 @@ class Work:
         return float(np.median(mahalanobis(self.snapshot.poses, newest))) > self.settings.misfit
 
     def _solve(self, poses: F64, closures: list[Closure], start_scale: float = 100.0) -> Solution:
-        edges = self.snapshot.path.joined(edges_of(closures))
         self._events["optimised"] += 1
-        return optimise(poses, edges, start_scale=start_scale, most_steps=25 if self.snapshot.thorough else 12)
+        return optimise(
+            poses, self._edges(closures), start_scale=start_scale, most_steps=25 if self.snapshot.thorough else 12
+        )
 
     def _weights(self, poses: F64, closures: list[Closure]) -> F64:
-        return weights_of(poses, self.snapshot.path.joined(edges_of(closures)))
+        return weights_of(poses, self._edges(closures))
+
+    def _edges(self, closures: Sequence[Closure]) -> Edges:
+        """The path and these closures, the snapshot's own first: its edges are made once."""
+        if self._known is None:
+            self._known = self.snapshot.path.joined(edges_of(self.snapshot.closures))
+        known = len(self.snapshot.closures)
+        if len(closures) >= known and all(a is b for a, b in zip(closures, self.snapshot.closures)):
+            return self._known.joined(edges_of(closures[known:])) if len(closures) > known else self._known
+        return self.snapshot.path.joined(edges_of(closures))
 
 
 def _apart(a: Pose2, b: Pose2) -> bool:
@@ -507,25 +393,9 @@ def _apart(a: Pose2, b: Pose2) -> bool:
 
 
 def _numbered(closures: list[Closure], number: int) -> tuple[tuple[Closure, ...], int]:
-    """Closures with names; the next free name."""
-    out = []
-    for closure in closures:
-        if closure.number < 0:
-            closure = replace(closure, number=number)
-            number += 1
-        out.append(closure)
-    return tuple(out), number
-
-
-def turned_information(information: F64, yaw_rad: float) -> F64:
-    """An information matrix over (x, y, yaw) in a frame turned by yaw_rad against the one it is given in."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(turn @ information @ turn.T)
-
-
-def floored(information: F64, floor_m: float, floor_rad: float) -> F64:
-    """An information matrix after errors of floor_m and floor_rad that no matcher sees were added."""
-    covariance = np.linalg.inv(information + 1e-6 * np.eye(3)) + np.diag([floor_m**2, floor_m**2, floor_rad**2])
-    inverse = np.linalg.inv(covariance)
-    return np.asarray(0.5 * (inverse + inverse.T))
+    """Closures with names, the new ones standing last; the next free name."""
+    known = len(closures)
+    while known and closures[known - 1].number < 0:
+        known -= 1
+    new = [replace(closure, number=number + k) for k, closure in enumerate(closures[known:])]
+    return (*closures[:known], *new), number + len(new)

@@ -32,16 +32,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import IDENTITY, Pose2, compose_covariance, exp_se2, log_se2
-from mapping.localise.closures import (
-    REFINING,
+from mapping.localise.closure_records import (
     Closure,
     ClosureSettings,
     Snapshot,
-    Work,
     WorkResult,
     floored,
+    floored_covariance,
     turned_information,
 )
+from mapping.localise.closures import REFINING, Work
 from mapping.localise.kept_places import KeptPlaces
 from mapping.localise.key_path import KeyPath
 from mapping.localise.pose_graph import composed_poses
@@ -536,7 +536,7 @@ class Slam:
         if match is not None:
             information = information + turned_information(match.information(), -before.yaw_rad)
         else:
-            information = np.linalg.inv(np.linalg.inv(information) + self._unseen())
+            information = np.asarray(np.linalg.inv(np.linalg.inv(information) + self._unseen()), dtype=np.float64)
         return floored(information, s.floor_m, s.floor_rad)
 
     def _unseen(self) -> F64:
@@ -569,8 +569,9 @@ class Slam:
             self._scan_in_key.append((in_key.x_m, in_key.y_m, in_key.yaw_rad))
         covariance = self._key_covariance
         if not is_key and match is not None:
-            held = floored(turned_information(match.information(), -key_pose.yaw_rad), 0.005, math.radians(0.1))
-            covariance = compose_covariance(key_pose, covariance, in_key, np.linalg.inv(held))
+            seen = turned_information(match.information(), -key_pose.yaw_rad)
+            held = floored_covariance(seen, 0.005, math.radians(0.1))
+            covariance = compose_covariance(key_pose, covariance, in_key, held)
         elif match is None and key > 0:
             covariance = covariance + self._unseen()
         return SlamUpdate(stamp_ns, map_from_base, covariance, match is not None or key == 0, key, is_key, self.epoch)

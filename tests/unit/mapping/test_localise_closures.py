@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
-from mapping.localise.closures import Closure, ClosureSettings, Snapshot, Work, edges_of
+from mapping.localise.closure_records import Closure, ClosureSettings, Snapshot, edges_of
+from mapping.localise.closures import Work
 from mapping.localise.pose_graph import Edges
 from mapping.localise.scan_match import Agreement
 from mapping.localise.views import ViewStore
