@@ -26,7 +26,8 @@ class ClosureSettings:
     often, at most `searches` times in one piece of work.  score, rival: of a search, see Found.
     explained, overlap, mean_cost: of the points, see Agreement and Match; half_*: what still has half a vote.
     weakest_per_m2: least information in the worst direction.  rough_*: what still has rough_worth of a vote: outdoors
-    nothing is a plane and little holds a pose, but nearly all that was seen is seen again.
+    nothing is a plane and little holds a pose, but nearly all that was seen is seen again.  rough_weight: what one
+    needs in the graph with the group it came with.
     surprise: squared Mahalanobis distance of a searched closure, by the covariance along the way, beyond which nothing
     explains it; held_m: steps less sure than that are held by the wheels alone, see Uncertainty.
     agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way,
@@ -63,6 +64,7 @@ class ClosureSettings:
     rough_mean_cost: float = 0.60
     rough_weakest_per_m2: float = 250.0
     rough_worth: float = 0.34
+    rough_weight: float = 0.65
     surprise: float = 12.0
     held_m: float = 0.0115
     expected: float = 6.25

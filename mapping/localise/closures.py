@@ -85,10 +85,14 @@ class Work:
         group, waiting = self._agreeing(pending)
         if group:
             trial = self._solve(poses, accepted + group, start_scale=1e4)
-            if float(np.median(trial.weight[len(shot.path) + len(accepted) :])) >= 0.25:
-                accepted, pending, poses, unoptimised = accepted + group, waiting, trial.poses, 0
-                self._events["accepted_after_probation"] += len(group)
-                weight = trial.weight
+            known = len(shot.path) + len(accepted)
+            if float(np.median(trial.weight[known:])) >= 0.25:
+                stays = self._staying(group, trial.weight[known:])
+                accepted += [closure for closure, good in zip(group, stays) if good]
+                pending, poses, unoptimised = waiting, trial.poses, 0
+                self._events["accepted_after_probation"] += int(stays.sum())
+                self._events["undone"] += int((~stays).sum())
+                weight = np.concatenate((trial.weight[:known], trial.weight[known:][stays]))
             else:
                 pending = waiting
                 self._events["undone"] += len(group)
@@ -330,6 +334,13 @@ class Work:
             return [], pending
         chosen = set(best)
         return [pending[k] for k in best], [c for k, c in enumerate(pending) if k not in chosen]
+
+    def _staying(self, group: list[Closure], weight: F64) -> NDArray[np.bool_]:
+        """(C,) which of a group that was accepted stay: rough ones only if the others bear them out, unless that were
+        few. Along a corridor one may slide from niche to niche and be far surer of it than it should."""
+        is_rough = np.array([closure.worth <= self.settings.rough_worth for closure in group])
+        stays = np.asarray(~is_rough | (weight >= self.settings.rough_weight))
+        return stays if 2 * stays.sum() >= len(stays) else np.ones_like(stays)
 
     def _same_correction(self, a: Closure, b: Closure, *, strict: bool = True) -> bool:
         """Whether two closures move the robot to the same place, drift between them allowed for."""

@@ -104,3 +104,12 @@ def test_what_a_single_closure_is_worth(
     agrees: Agreement, mean_cost: float, weakest_per_m2: float, worth: float
 ) -> None:
     assert work(0, 1.0)[0]._worth(agrees, mean_cost, weakest_per_m2) == worth
+
+
+def test_rough_ones_stay_if_the_others_bear_them_out() -> None:
+    judge, rough = work(4, ROUGH)
+    sure = work(2, 1.0)[1]
+    assert judge._staying([*sure, *rough], np.array([0.3, 0.9, 0.5, 0.9, 0.9, 0.9])).tolist() == [
+        True, True, False, True, True, True,
+    ]  # fmt: skip
+    assert judge._staying(rough, np.array([0.3, 0.4, 0.5, 0.9])).all()
