@@ -49,6 +49,7 @@ from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
 from mapping.kernels import motion
 from mapping.mixed_pixels import without_mixed_pixels
+from mapping.narrow_gaps import without_narrow_gaps
 from mapping.odometry import DifferentialOdometry, DriveGeometry, FollowedPoses, OdometryState
 from mapping.pose_buffer import GoneError, PoseBuffer
 from mapping.scan import Scan
@@ -322,7 +323,7 @@ class Fusion:
         self._sectors_untold: set[int] = set()  # changed since they were published
         self._newest_stamp_ns = 0
         self._late_since_ns: int | None = None
-        self._mixed_pixels = self._beams_on_robot = 0
+        self._mixed_pixels = self._beams_on_robot = self._narrow_gaps = 0
         self._tilting = {mount.settings.laser: mount for mount in parts.mounts}
         self._by_axle = {mount.settings.name: mount for mount in parts.mounts}
         self._around = [grid for grid in parts.grids if isinstance(grid, FollowsCorrections)]
@@ -391,6 +392,7 @@ class Fusion:
             "fusion.waiting_for_odometry": len(self._waiting),
             "fusion.held_back": len(self._held),
             "fusion.mixed_pixels": self._mixed_pixels,
+            "fusion.narrow_gaps": self._narrow_gaps,
             "fusion.beams_on_robot": self._beams_on_robot,
             **self._parts.localiser.counters(),
         }
@@ -503,9 +505,11 @@ class Fusion:
         )
 
     def _to_draw(self, laser: Laser, scan: Scan) -> Scan:
-        """The scan without what ends on the robot itself, and without mixed pixels."""
+        """The scan without what ends on the robot itself, mixed pixels, and nothings between surfaces close by."""
         ranges, mixed = without_mixed_pixels(scan.bearing_rad, scan.range_m)
+        ranges, narrow = without_narrow_gaps(scan.bearing_rad, ranges)
         self._mixed_pixels += mixed
+        self._narrow_gaps += narrow
         footprint = self._parts.footprint
         if footprint is not None:
             seen = ranges

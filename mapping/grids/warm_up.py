@@ -13,6 +13,7 @@ from mapping.grids.evidence import Model
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.kernels.beams import drop_own
 from mapping.mixed_pixels import without_mixed_pixels
+from mapping.narrow_gaps import without_narrow_gaps
 from mapping.scan import Scan
 
 
@@ -22,6 +23,7 @@ def warm_up(model: Model = "counters") -> None:
     ranges = np.array([1.0, 1.0, np.inf, 2.0, 1.0, np.nan, -np.inf, 1.0, 1.0])
     grid = OccupancyGrid(model=model, max_tiles=16)
     ranges, _ = without_mixed_pixels(bearing, ranges)
+    without_narrow_gaps(bearing, np.full(len(bearing), math.inf))
     drop_own(bearing, ranges, 0.0, 0.0, 0.0, np.eye(3, 2), math.nan, np.empty_like(ranges))
     grid.insert_scan(Pose2(), bearing, ranges, range_max_m=2.0, range_min_m=0.1)
     for drift_m in (0.0, 1.0):  # as a fan, and line by line

@@ -87,6 +87,46 @@ def drop_mixed(
 
 
 @njit(cache=True)
+def close_narrow_gaps(bearing: Any, narrow_m: float, kept: Any) -> int:
+    """In place: +inf of (N,) distances becomes NaN between two ends less than narrow_m apart; returns how many.
+
+    The beams are a turn or a part of one in order. See mapping.narrow_gaps.
+    """
+    n = len(kept)
+    first = -1  # a beam with a range to begin with
+    for k in range(n):
+        if kept[k] > 0.0 and math.isfinite(kept[k]):
+            first = k
+            break
+    if first < 0:
+        return 0
+    usual = abs(bearing[n - 1] - bearing[0]) / max(n - 1, 1)
+    is_turn = n > 2 and angle_between(bearing[n - 1], bearing[0]) < 2.0 * usual
+    dropped, last, gap, is_open = 0, first, 0, False
+    for step in range(1, n + 1):
+        k = (first + step) % n
+        if k == 0 and not is_turn:
+            is_open = True  # the end of the field of view
+        r = kept[k]
+        if not (r > 0.0 and math.isfinite(r)):
+            gap += r == math.inf
+            is_open = is_open or r <= 0.0
+            continue
+        if gap > 0 and not is_open:
+            a, turn = kept[last], angle_between(bearing[k], bearing[last])
+            if a * a + r * r - 2.0 * a * r * math.cos(turn) < narrow_m * narrow_m:
+                for back in range(1, n):
+                    j = (k - back) % n
+                    if j == last:
+                        break
+                    if kept[j] == math.inf:
+                        kept[j] = math.nan
+                        dropped += 1
+        last, gap, is_open = k, 0, False
+    return dropped
+
+
+@njit(cache=True)
 def drop_own(
     bearing: Any, distance: Any, x_m: float, y_m: float, yaw_rad: float, polygon: Any, too_close_m: float, kept: Any
 ) -> int:
