@@ -1,11 +1,12 @@
-"""Voronoi diagram, planner and grid A* on a plan of 2,000 x 2,000 cells, in one run.
+"""Voronoi diagram, planner and grid A* on plans of 2,000 x 2,000 cells, in one run.
 
-    python bench/planning.py [--pairs N] [--json FILE]
+    python bench/planning.py [--pairs N] [--plan NAME] [--json FILE]
 
-The plan is an office of corridors and furnished rooms, 100 m square in cells of 5 cm (made here, seed 7). Figures:
+The plans are in plans.py. Times are of the processor. Figures; those of the diagram are of the first plan:
 scratch     distances, base points and diagram of the whole grid; scikit-image's medial axis beside it, if installed
 update      after one scan has changed some hundreds of cells up to 10 m around a place
 graph       thinning the diagram and following its lines: makes a planner warm
+corners     what is made once for a clearance, on the graph
 plan        from a free place to another anywhere on the plan, with 0.3 m of clearance; longest and median
 A*          on the grid with the same cells allowed, eight neighbours, straight distance as bound; compiled, with
             work arrays kept from call to call
@@ -19,63 +20,20 @@ import json
 import math
 import sys
 import time
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from bench.plans import CELL_M, PLANS, SIDE, Bools, hall_of_boxes
 from mapping.hybrid.planner import HALF_CELLS, NoWayError, Planner, graph_of
 from mapping.hybrid.voronoi import VoronoiGrid
 from mapping.kernels.paths import pop, push
 
-CELL_M = 0.05
-SIDE = 2000
 CLEARANCE_M = 0.3
-
-Bools = NDArray[np.bool_]
-F64 = NDArray[np.float64]
-
-
-def office(seed: int = 7, side: int = SIDE) -> Bools:
-    """Free cells: corridors 2.5 m wide every 17.5 m both ways, between them rooms with doors and furniture."""
-    random = np.random.default_rng(seed)
-    free = np.zeros((side, side), dtype=np.bool_)
-    pitch, wide = 350, 50
-    starts = range(10, side - wide, pitch)
-    for at in starts:
-        free[at : at + wide, 10 : side - 10] = True
-        free[10 : side - 10, at : at + wide] = True
-    for top in (at + wide + 4 for at in starts):
-        for left in (at + wide + 4 for at in starts):
-            bottom, right = min(top + pitch - wide - 8, side - 10), min(left + pitch - wide - 8, side - 10)
-            _block(free, random, top, left, bottom, right)
-    return free
-
-
-def _block(free: Bools, random: np.random.Generator, top: int, left: int, bottom: int, right: int) -> None:
-    """Four to nine rooms in a rectangle, doors of a metre to the corridors and to each other."""
-    rows = np.linspace(top, bottom, int(random.integers(3, 5))).astype(int)
-    cols = np.linspace(left, right, int(random.integers(3, 5))).astype(int)
-    for r0, r1 in pairwise(rows):
-        for c0, c1 in pairwise(cols):
-            if r1 - r0 < 40 or c1 - c0 < 40:
-                continue
-            free[r0 + 2 : r1 - 2, c0 + 2 : c1 - 2] = True
-            for _ in range(int((r1 - r0) * (c1 - c0) / 1500)):
-                r, c = random.integers(r0 + 25, r1 - 25), random.integers(c0 + 25, c1 - 25)
-                free[r : r + random.integers(1, 9), c : c + random.integers(1, 9)] = False
-            for _ in range(2):
-                if random.random() < 0.5:
-                    at, edge = random.integers(c0 + 4, c1 - 26), (r0, r1)[random.integers(2)]
-                    free[max(edge - 6, 10) : edge + 6, at : at + 20] = True
-                else:
-                    at, edge = random.integers(r0 + 4, r1 - 26), (c0, c1)[random.integers(2)]
-                    free[at : at + 20, max(edge - 6, 10) : edge + 6] = True
 
 
 @njit(cache=True, nogil=True)
@@ -146,9 +104,9 @@ def timed(work: Any, rounds: int = 5) -> float:
     """Median milliseconds."""
     times = []
     for _ in range(rounds):
-        started = time.perf_counter()
+        started = time.process_time()
         work()
-        times.append(1e3 * (time.perf_counter() - started))
+        times.append(1e3 * (time.process_time() - started))
     return float(np.median(times))
 
 
@@ -164,9 +122,9 @@ def diagram_figures(free: Bools) -> dict[str, float]:
         cells = np.stack((row + reach * np.sin(angle), col + reach * np.cos(angle)), axis=-1).astype(np.int64)
         cells = np.clip(cells, 1, SIDE - 2)
         blocked = random.random(600) < 0.5
-        started = time.perf_counter()
+        started = time.process_time()
         grid.set_cells(cells[blocked], cells[~blocked])
-        times.append(1e3 * (time.perf_counter() - started))
+        times.append(1e3 * (time.process_time() - started))
     figures |= {"update_ms": float(np.median(times[5:])), "update_most_ms": max(times[5:])}
     try:
         medial_axis = importlib.import_module("skimage.morphology").medial_axis
@@ -179,6 +137,9 @@ def planning_figures(free: Bools, pairs: int) -> dict[str, float]:
     """Planner against A*, over random pairs of places."""
     grid = VoronoiGrid(free)
     planner, a_star = Planner(grid, CELL_M), GridAStar(grid, CLEARANCE_M)
+    started = time.process_time()
+    planner.ready_for(CLEARANCE_M)
+    corners_ms = 1e3 * (time.process_time() - started)
     random = np.random.default_rng(2)
     room = np.argwhere(grid.field.squared >= math.ceil((CLEARANCE_M / CELL_M + HALF_CELLS) ** 2))
     rows: list[tuple[float, float, float, float]] = []
@@ -187,14 +148,14 @@ def planning_figures(free: Bools, pairs: int) -> dict[str, float]:
         start, goal = ((int(room[i, 0]), int(room[i, 1])) for i in random.integers(len(room), size=2))
         places = [((c + 0.5) * CELL_M, (r + 0.5) * CELL_M) for r, c in (start, goal)]
         tried += 1
-        started = time.perf_counter()
+        started = time.process_time()
         try:
             length = planner.plan(places[0], places[1], clearance_m=CLEARANCE_M, alternatives=0).way.length_m
         except NoWayError:
             length = math.inf
-        middle = time.perf_counter()
+        middle = time.process_time()
         reference = a_star.length(start, goal)
-        ended = time.perf_counter()
+        ended = time.process_time()
         if math.isinf(length) != math.isinf(reference):
             missed += 1
         if math.isfinite(length) and math.isfinite(reference) and tried > 3:
@@ -202,7 +163,7 @@ def planning_figures(free: Bools, pairs: int) -> dict[str, float]:
     table = np.array(rows)
     ratio = table[:, 2] / np.maximum(table[:, 3], CELL_M)
     return {
-        "plan_ms": float(np.median(table[:, 0])), "plan_most_ms": float(table[:, 0].max()),
+        "corners_ms": corners_ms, "plan_ms": float(np.median(table[:, 0])), "plan_most_ms": float(table[:, 0].max()),
         "a_star_ms": float(np.median(table[:, 1])), "times_faster": float(np.median(table[:, 1] / table[:, 0])),
         "times_faster_in_all": float(table[:, 1].sum() / table[:, 0].sum()), "longer_mean": float(ratio.mean() - 1.0),
         "longer_99": float(np.percentile(ratio, 99) - 1.0), "longer_most": float(ratio.max() - 1.0),
@@ -214,12 +175,22 @@ def planning_figures(free: Bools, pairs: int) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=200)
+    parser.add_argument("--plan", choices=PLANS, help="this one only")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    free = office()
-    figures = {**diagram_figures(free), **planning_figures(free, arguments.pairs)}
-    for name, value in figures.items():
-        print(f"{name:24} {value:.4g}")
+    names = [arguments.plan] if arguments.plan else list(PLANS)
+    warm = Planner(VoronoiGrid(hall_of_boxes(side=400, boxes=100)), CELL_M)  # compiles
+    warm.plan((2.0, 2.0), (18.0, 18.0), alternatives=0)
+    figures: dict[str, dict[str, float]] = {}
+    for name in names:
+        free = PLANS[name]()
+        figures[name] = {
+            **(diagram_figures(free) if name == names[0] else {}),
+            **planning_figures(free, arguments.pairs),
+        }
+        print(name)
+        for what, value in figures[name].items():
+            print(f"  {what:24} {value:.4g}", flush=True)
     if arguments.json:
         arguments.json.write_text(json.dumps(figures, indent=2))
 

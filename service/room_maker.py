@@ -101,6 +101,7 @@ class RoomMaker:
         """By id: the cell [row, col] of the map where the room is widest."""
         self._diagram: VoronoiGrid | None = None
         self._planner: Planner | None = None
+        self._asked_m: float | None = None  # the clearance of the last plan
         self._here: Pose2 | None = None
         self._told = b""
         self._planned: dict[str, Any] | None = None
@@ -152,6 +153,8 @@ class RoomMaker:
         self._planner = Planner(
             self._diagram, self._grid.resolution_m, row0=self._grid.row0 - 1, col0=self._grid.col0 - 1
         )
+        if self._asked_m is not None:
+            self._planner.ready_for(self._asked_m)
 
     def _find_middles(self) -> None:
         """Where each room is widest, furniture and all; as long as it is about as wide there, where it was."""
@@ -341,6 +344,7 @@ class RoomMaker:
             raise CallRefused(f'"alternatives" is a whole number up to {_ALTERNATIVES_MAX}, got {json.dumps(count)}')
         if self._planner is None:
             raise CallRefused("no grid is known yet: let the robot see some free space first")
+        self._asked_m = float(clearance_m)
         start, goal = self._place(arguments.get("start"), "start"), self._place(arguments.get("goal"), "goal")
         stands_at = start.at
         if start.told is None:

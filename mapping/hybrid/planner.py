@@ -1,7 +1,8 @@
 """Planning on the Voronoi diagram, made straight on the grid (S44).
 
-A way is looked for on the graph of the diagram, which is small, and then pulled taut on the grid, which makes it about
-as short as any. Every cell that it crosses is free and keeps the clearance; unknown cells are obstacles like others.
+A way is looked for from corner to corner, or, where these do not join the ends, and for others that go elsewhere, on
+the graph of the diagram, which is small. It is then pulled taut on the grid, which makes it about as short as any.
+Every cell that it crosses is free and keeps the clearance; unknown cells are obstacles like others.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grids.geometry import check_resolution
+from mapping.hybrid.corners import CornerGraph, landmarks
 from mapping.hybrid.voronoi import VoronoiGrid
 from mapping.kernels import paths as kernels
+from mapping.kernels.rooms import connected
 
 Bools = NDArray[np.bool_]
 F64 = NDArray[np.float64]
@@ -27,9 +30,9 @@ HALF_CELLS = math.sqrt(2.0)
 _USED_AGAIN = 1.4  # what an edge of an earlier way costs in the search for others
 _ELSEWHERE = 0.3  # of an alternative's length, at least
 _PULLS = 2
-_LANDMARKS = 8
-_CLEARANCES_KEPT = 4
-_NEAR_CELLS = 120  # ends nearer than this are joined on the grid, where the diagram may be a detour
+_CLEARANCES_KEPT = 3
+_NEAR_CELLS = 120  # ends nearer than this are joined on the grid, too, if the way is so much longer than straight on:
+_DETOUR = 1.1
 
 
 class NoWayError(ValueError):
@@ -104,26 +107,13 @@ def graph_of(grid: VoronoiGrid) -> DiagramGraph:
     chord = np.hypot(*(places[edge[:, kernels.A]] - places[edge[:, kernels.B]]).astype(np.float64).T)
     return DiagramGraph(
         places, node[:nodes].copy(), edge, chain[:chained].copy(), along[:chained].copy(), measure[:, 0].copy(), chord,
-        measure[:, 1].copy(), where, first, link, leads_out, _landmarks(first, link, edge, chord),
+        measure[:, 1].copy(), where, first, link, leads_out, landmarks(first, link, edge, chord),
     )  # fmt: skip
 
 
-def _landmarks(first: I32, link: I32, edge: I32, cost: F64) -> NDArray[np.float32]:
-    """Distances from nodes each of which is as far as can be from those before it."""
-    nodes = len(first) - 1
-    mark = np.empty((nodes, min(_LANDMARKS, nodes)), dtype=np.float32)
-    away, row = np.full(nodes, np.inf, dtype=np.float32), np.empty(nodes, dtype=np.float32)
-    source = 0
-    for k in range(mark.shape[1]):
-        kernels.distances_from(source, first, link, edge, cost, row)
-        mark[:, k] = row
-        away = np.minimum(away, row)
-        source = int(np.argmax(away))
-    return mark
-
-
 class Planner:
-    """Plans on one state of a grid. Making it costs some tens of milliseconds for millions of cells, a plan little.
+    """Plans on one state of a grid. Making it costs some tens of milliseconds for millions of cells, the first plan
+    with a clearance some hundreds, others little.
 
     Not to be used from two threads at once. The grid must not change under it.
     """
@@ -158,10 +148,9 @@ class Planner:
             raise ValueError(f"clearance_m is a length, got {clearance_m}")
         need = clearance_m / self.resolution_m + HALF_CELLS
         begin, end = self._cell("start", start, need), self._cell("goal", goal, need)
-        ways = self._candidates(begin, end, need, 1 + 2 * alternatives if alternatives > 0 else 1)
-        if not ways:
+        pulled = self._ways(begin, end, need, alternatives)
+        if not pulled:
             raise NoWayError(f"no way with {clearance_m:.2f} m of clearance leads from the start to the goal")
-        pulled = [self._taut(cells, begin, end, need) for cells in ways]
         pulled.sort(key=lambda corners: float(kernels.length_of(corners, len(corners))))
         kept = pulled[:1]
         for corners in pulled[1:]:
@@ -169,6 +158,34 @@ class Planner:
                 kept.append(corners)
         described = [self._describe(corners) for corners in kept]
         return Plan(described[0], tuple(described[1:]))
+
+    def _ways(self, begin: F64, end: F64, need: float, alternatives: int) -> list[F64]:
+        """Corners of ways that are pulled taut, in any order; none only if the grid has none."""
+        if not self._are_joined(begin, end, need):
+            return []
+        found = self._tables_for(need).corners.way(begin, end)
+        ways = [] if found is None else [found]
+        straight = math.hypot(*(end - begin))
+        if straight <= _NEAR_CELLS and (found is None or kernels.length_of(found, len(found)) > _DETOUR * straight):
+            cells = self._on_grid(begin, end, need, margin=_NEAR_CELLS // 3)
+            if len(cells):
+                ways.append(self._taut(cells, begin, end, need))
+        if not ways or alternatives > 0:
+            tries = 1 + 2 * alternatives if alternatives > 0 else 1
+            ways += [self._taut(cells, begin, end, need) for cells in self._candidates(begin, end, need, tries)]
+        if not ways:
+            ways.append(self._taut(self._on_grid(begin, end, need, margin=max(self.grid.shape)), begin, end, need))
+        return ways
+
+    def _are_joined(self, begin: F64, end: F64, need: float) -> bool:
+        """Whether the cells of both hang together."""
+        part = self._tables_for(need).part
+        (r0, c0), (r1, c1) = np.floor(begin + 0.5).astype(int), np.floor(end + 0.5).astype(int)
+        return bool(part[r0, c0] == part[r1, c1])
+
+    def ready_for(self, clearance_m: float) -> None:
+        """Make now what the first plan with this clearance would have to wait for."""
+        self._tables_for(clearance_m / self.resolution_m + HALF_CELLS)
 
     def _cell(self, what: str, place: tuple[float, float], need: float) -> F64:
         """(row, col) in cells, a cell's centre at whole numbers; NoWayError if it is not free enough."""
@@ -190,19 +207,11 @@ class Planner:
         return np.array((at_row, at_col))
 
     def _candidates(self, begin: F64, end: F64, need: float, tries: int) -> list[I32]:
-        """Ways from cell to cell: straight or on the grid if the ends are near; on the graph, shortest first."""
+        """Ways from cell to cell on the graph, shortest first."""
         width = self.grid.shape[1]
         start, goal = (int(r) * width + int(c) for r, c in (np.floor(begin + 0.5), np.floor(end + 0.5)))
         found: list[I32] = []
-        if kernels.sees_by_room(self._tables_for(need).room, *begin, *end):
-            found.append(np.empty(0, dtype=np.int32))
         need2 = math.ceil(need * need)
-        if not found and math.hypot(*(end - begin)) <= _NEAR_CELLS:
-            cells = self._on_grid(start, goal, need2)
-            if len(cells):
-                found.append(cells)
-        if found and tries == 1:
-            return found
         outward, met = self._reach(start, goal, need2)
         if outward is None:
             return found
@@ -248,26 +257,30 @@ class Planner:
         return found
 
     def _tables_for(self, need: float) -> _Tables:
-        """Kept for the clearances asked for last; some milliseconds for millions of cells."""
+        """Kept for the clearances asked for last."""
         tables = self._tables.pop(need, None)
         if tables is None:
             graph, room = self.graph, np.empty(self.grid.shape, dtype=np.uint8)
             usable = np.empty(len(graph.edge), dtype=np.bool_)
             kernels.open_edges(graph.edge, graph.least_squared, math.ceil(need * need), graph.leads_out, usable)
             kernels.measure_room(self.grid.field.squared, need, room)
-            tables = _Tables(usable, room)
+            part = np.empty(self.grid.shape, dtype=np.int32)
+            connected(room > 0, True, part)
+            corners = CornerGraph(self.grid, need, room, graph.edge, graph.chain, graph.first)
+            tables = _Tables(usable, room, corners, part)
         self._tables[need] = tables
         if len(self._tables) > _CLEARANCES_KEPT:
             del self._tables[next(iter(self._tables))]
         return tables
 
-    def _on_grid(self, start: int, goal: int, need2: int) -> I32:
+    def _on_grid(self, begin: F64, end: F64, need: float, *, margin: int) -> I32:
         """Cells of the shortest way within a window around both; none if there is no such way."""
-        (height, width), margin = self.grid.shape, _NEAR_CELLS // 3
-        rows, cols = sorted((start // width, goal // width)), sorted((start % width, goal % width))
-        top, left = max(rows[0] - margin, 0), max(cols[0] - margin, 0)
-        window = min(rows[1] + margin + 1, height) - top, min(cols[1] + margin + 1, width) - left
-        cells = np.empty(window[0] * window[1], dtype=np.int32)
+        height, width = self.grid.shape
+        (r0, c0), (r1, c1) = (np.floor(at + 0.5).astype(int).tolist() for at in (begin, end))
+        top, left = max(min(r0, r1) - margin, 0), max(min(c0, c1) - margin, 0)
+        window = min(max(r0, r1) + margin + 1, height) - top, min(max(c0, c1) + margin + 1, width) - left
+        cells, start, goal = np.empty(window[0] * window[1], dtype=np.int32), r0 * width + c0, r1 * width + c1
+        need2 = math.ceil(need * need)
         n = int(kernels.way_on_grid(self.grid.field.squared, need2, start, goal, top, left, *window, cells))
         return cells[:n][::-1]
 
@@ -350,10 +363,13 @@ class Planner:
 
 @dataclass(frozen=True, slots=True)
 class _Tables:
-    """For one clearance. usable: (E,) edges wide enough, without dead ends.  room: (R, C) from kernels.measure_room."""
+    """For one clearance. usable: (E,) edges wide enough, without dead ends.  room: (R, C) from kernels.measure_room.
+    corners: of the same clearance.  part: (R, C), cells of one number hang together, -1 where there is too little."""
 
     usable: Bools
     room: NDArray[np.uint8]
+    corners: CornerGraph
+    part: I32
 
 
 @dataclass(frozen=True, slots=True)

@@ -738,7 +738,11 @@ def describe(squared: Any, corner: Any, n: int, spacing: float, pose: Any, clear
     m = refine(corner, n, spacing, point)
     for i in range(m):
         pose[i, 0], pose[i, 1] = point[i, 0], point[i, 1]
-        clear[i] = math.sqrt(squared[math.floor(point[i, 0] + 0.5), math.floor(point[i, 1] + 0.5)])
+        clear[i] = 0.0
+        for side in range(4):  # on the border of cells, what holds for one of them holds
+            r = math.floor(point[i, 0] + 0.5 + (1e-9 if side < 2 else -1e-9))
+            c = math.floor(point[i, 1] + 0.5 + (1e-9 if side % 2 == 0 else -1e-9))
+            clear[i] = max(clear[i], math.sqrt(squared[r, c]))
         if i < m - 1:
             pose[i, 2] = math.atan2(point[i + 1, 0] - point[i, 0], point[i + 1, 1] - point[i, 1])
         else:

@@ -8,6 +8,7 @@ import networkx as nx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from mapping.hybrid.planner import HALF_CELLS, NoWayError, Planner, Way, graph_of
 from mapping.hybrid.voronoi import VoronoiGrid
@@ -55,7 +56,8 @@ def check_way(way: Way, grid: VoronoiGrid, clearance_m: float) -> None:
     lengths = np.hypot(steps[:, 0], steps[:, 1])
     assert way.length_m == pytest.approx(lengths.sum())
     assert lengths.max(initial=0.0) <= 0.5 + 1e-9
-    assert np.allclose(np.arctan2(steps[:, 1], steps[:, 0]), way.poses[:-1, 2])
+    turn = np.arctan2(steps[:, 1], steps[:, 0]) - way.poses[:-1, 2]
+    assert np.allclose(np.remainder(turn + 1.0, 2.0 * math.pi), 1.0)
     assert way.least_clearance_m >= clearance_m - 1e-9
     assert way.least_clearance_m <= way.clearance_m.min() + 1e-9
     squares = (np.argwhere(grid.field.obstacle)[:, ::-1] + 0.5) * CELL_M
@@ -93,6 +95,61 @@ def test_ways_exist_where_the_grid_has_one_and_are_about_as_short(seed: int, cle
         ratios.append(plan.way.length_m / max(expected, CELL_M))
     assert np.median(ratios) <= 1.0  # any direction is allowed, on the grid only eight
     assert max(ratios) <= 1.03
+
+
+def wild(seed: int, rows: int = 150, cols: int = 200) -> Bools:
+    """Free space of no shape at all: rough edges, narrow gaps, islands, pieces that nothing joins."""
+    random = np.random.default_rng(seed)
+    rough = ndimage.gaussian_filter(random.standard_normal((rows, cols)), random.uniform(2.0, 6.0))
+    free = rough + 0.1 * rough.std() * random.standard_normal((rows, cols)) > -0.5 * rough.std()
+    free[[0, -1]] = free[:, [0, -1]] = False
+    return np.asarray(free)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_ways_through_the_wild_keep_the_clearance_and_are_about_as_short(seed: int) -> None:
+    grid = VoronoiGrid(wild(seed), gap_cells=1.0)
+    planner = Planner(grid, CELL_M)
+    random = np.random.default_rng(seed)
+    clearance_m = (0.0, 0.05, 0.12)[seed % 3]
+    places = np.argwhere(grid.field.squared >= (clearance_m / CELL_M + HALF_CELLS) ** 2)
+    ratios = []
+    for _ in range(3):
+        start = tuple(int(v) for v in places[random.integers(len(places))])
+        lengths = grid_lengths(grid, clearance_m, (start[0], start[1]))
+        for goal in places[random.integers(len(places), size=8)].tolist():
+            expected = lengths.get((goal[0], goal[1]))
+            if expected is None:
+                with pytest.raises(NoWayError, match="no way"):
+                    planner.plan(place(*start), place(*goal), clearance_m=clearance_m)
+                continue
+            plan = planner.plan(place(*start), place(*goal), clearance_m=clearance_m, alternatives=seed % 2)
+            for way in (plan.way, *plan.alternatives):
+                check_way(way, grid, clearance_m)
+            ratios.append(plan.way.length_m / max(expected, CELL_M))
+    assert np.median(ratios) <= 1.0
+    assert np.mean(np.array(ratios) > 1.03) <= 0.2  # rougher than any map, at clearances of some cells
+
+
+def test_where_corners_know_no_way_the_diagram_does() -> None:
+    grid = VoronoiGrid(cluttered(2), gap_cells=1.0)
+    planner = Planner(grid, CELL_M)
+    places = np.argwhere(grid.field.squared >= (0.1 / CELL_M + HALF_CELLS) ** 2).tolist()
+    ends = places[0], places[-1]
+    with_corners = planner.plan(place(*ends[0]), place(*ends[1]), clearance_m=0.1)
+    planner._tables_for(0.1 / CELL_M + HALF_CELLS).corners._first[:] = 0  # nothing joins them
+    without = planner.plan(place(*ends[0]), place(*ends[1]), clearance_m=0.1)
+    assert with_corners.way.length_m <= without.way.length_m <= 1.1 * with_corners.way.length_m
+
+
+def test_corners_see_what_they_are_joined_with() -> None:
+    grid = VoronoiGrid(cluttered(4), gap_cells=1.0)
+    planner, need = Planner(grid, CELL_M), 2.5
+    corners = planner._tables_for(need).corners
+    assert len(corners.pair) > len(corners.place) > 20
+    for a, b in corners.pair.tolist():
+        (r0, c0), (r1, c1) = corners.place[a].tolist(), corners.place[b].tolist()
+        assert kernels.sees(grid.field.squared, need, r0, c0, r1, c1)
 
 
 def test_two_openings_give_an_alternative() -> None:

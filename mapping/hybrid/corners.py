@@ -1,0 +1,154 @@
+"""Ways from corner to corner (S44): what a shortest way is made of.
+
+A shortest way is straight but where it goes round something. So for one clearance the corners of what keeps it are
+looked for, and joined where they see each other; in passages hardly wider than the clearance, where corners on both
+sides crowd each other out, the middle takes their place. A way on this graph is within some hundredths of the shortest
+and, once pulled taut, most often is that. Nothing rests on it: what it does not join, the diagram may.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.hybrid.voronoi import VoronoiGrid
+from mapping.kernels import corners as kernels
+from mapping.kernels.paths import distances_from
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+LANDMARKS = 8
+
+_BULGE = 0.555  # of the window around a corner's cell that is open; before a straight wall it is half and a row
+_APART, _APART_CELLS = 0.7, 2.0  # between corners on one side, by the clearance
+_PUSHED = 0.4  # outward, by the clearance: where the tangents on both sides of a right angle meet
+_NARROW, _NARROW_CELLS = 0.6, 4.0  # how much wider than the clearance a passage is that gets places in its middle
+_STEP, _STEP_MOST = 0.8, 6  # between these, by the clearance; cells
+_REACH = 4.0
+_PULLS = 2
+_HUGE = 1e30
+
+
+class CornerGraph:
+    """The corners of a grid for one clearance, joined. Some 100 ms for four million cells, a way some 0.2 ms.
+
+    Not to be used from two threads at once.
+    """
+
+    def __init__(
+        self, grid: VoronoiGrid, need: float, room: NDArray[np.uint8], edge: I32, chain: I32, first: I32
+    ) -> None:
+        """need: clearance in cells.  room: (R, C) from paths.measure_room.  edge, chain, first: of a DiagramGraph."""
+        self._room = room
+        place, outward = _corners(room, need)
+        middle = _passages(grid, need, edge, chain, first)
+        place = np.concatenate((place, middle))
+        outward = np.concatenate((outward, np.zeros((len(middle), 2))))
+        self._across = room.shape[1] // kernels.TILE + 1
+        tile = (place[:, 0] // kernels.TILE) * self._across + place[:, 1] // kernels.TILE
+        order = np.argsort(tile, kind="stable")
+        self.place, self.outward = np.ascontiguousarray(place[order]), np.ascontiguousarray(outward[order])
+        tiles = self._across * (room.shape[0] // kernels.TILE + 1)
+        self._tile = np.searchsorted(tile[order], np.arange(tiles + 1)).astype(np.int32)
+        self.pair = self._links()
+        self._join()
+        count = len(self.place)
+        self._best, self._via = np.empty(count), np.empty(count, dtype=np.int32)
+        self._to_go = np.empty(count)
+        self._state, self._stamp = np.zeros(count, dtype=np.int32), 0
+        most = len(self._other) + count + 1
+        self._heap, self._key = np.empty(most, dtype=np.int32), np.empty(most)
+        self._to_end = np.full(count, _HUGE)
+        self._which, self._far = np.empty(count, dtype=np.int32), np.empty(count)
+        self._point, self._work = np.empty((count + 2, 2)), np.empty((count + 2, 2))
+
+    def way(self, begin: F64, end: F64) -> F64 | None:
+        """Corners (N, 2) of a way between two open places (row, col in cells); None if none is known."""
+        self._stamp += 2
+        n = int(
+            kernels.way_round(
+                self._room, self.place, self.outward, self._tile, self._across, self._first, self._other, self._cost,
+                self._mark, begin, end, self._best, self._via, self._state, self._stamp,
+                self._to_go, self._heap, self._key, self._to_end, self._which, self._far, self._point,
+                self._work, _PULLS,
+            )
+        )  # fmt: skip
+        return self._point[:n].copy() if n else None
+
+    def _links(self) -> I32:
+        pair = np.empty((8 * len(self.place) + 64, 2), dtype=np.int32)
+        while True:
+            m = int(kernels.link_places(self._room, self.place, self.outward, self._tile, self._across, pair))
+            if m <= len(pair):
+                return pair[:m].copy()
+            pair = np.empty((m, 2), dtype=np.int32)
+
+    def _join(self) -> None:
+        count, pair = len(self.place), self.pair
+        length = np.hypot(*(self.place[pair[:, 0]] - self.place[pair[:, 1]]).astype(np.float64).T)
+        ends = np.concatenate((pair[:, 0], pair[:, 1]))
+        order = np.argsort(ends, kind="stable")
+        self._first = np.searchsorted(ends[order], np.arange(count + 1)).astype(np.int32)
+        self._other = np.concatenate((pair[:, 1], pair[:, 0]))[order]
+        self._cost = np.concatenate((length, length))[order]
+        link = np.tile(np.arange(len(pair), dtype=np.int32), 2)[order]
+        self._mark = landmarks(self._first, link, pair, length)
+
+
+def landmarks(first: I32, link: I32, edge: I32, cost: F64) -> NDArray[np.float32]:
+    """(N, L) distances from nodes of the largest part that hangs together (of those found in some tries), each of which
+    is as far as can be from those before it; huge where nothing joins a node with them."""
+    nodes = len(first) - 1
+    mark = np.empty((nodes, min(LANDMARKS, nodes)), dtype=np.float32)
+    row, known = np.empty(nodes, dtype=np.float32), np.zeros(nodes, dtype=np.bool_)
+    source, most = 0, 0
+    for _ in range(LANDMARKS):
+        start = int(np.argmin(known))
+        if not nodes or known[start] or np.count_nonzero(~known) <= most:
+            break
+        distances_from(start, first, link, edge, cost, row)
+        reached = row < 0.5 * _HUGE
+        known |= reached
+        if np.count_nonzero(reached) > most:
+            source, most = start, int(np.count_nonzero(reached))
+    away = np.full(nodes, np.inf, dtype=np.float32)
+    for k in range(mark.shape[1]):
+        distances_from(source, first, link, edge, cost, row)
+        mark[:, k] = row
+        away = np.minimum(away, row)
+        source = int(np.argmax(np.where(away < 0.5 * _HUGE, away, -1.0)))
+    return mark
+
+
+def _corners(room: NDArray[np.uint8], need: float) -> tuple[I32, F64]:
+    """Cells [row, col] a little off what a way goes round, and which way that is outward."""
+    total = np.empty((room.shape[0] + 1, room.shape[1] + 1), dtype=np.int32)
+    kernels.count_open(room, total)
+    reach = int(min(max(1.25 * need, _REACH), 20.0))
+    cell, score = np.empty(1 << 16, dtype=np.int32), np.empty(1 << 16, dtype=np.int32)
+    while (n := int(kernels.bulges(room, total, reach, _BULGE, cell, score))) > len(cell):
+        cell, score = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
+    cell = cell[:n][np.argsort(-score[:n], kind="stable")]
+    place, outward = np.empty((n, 2), dtype=np.int32), np.empty((n, 2))
+    apart = _APART * need + _APART_CELLS
+    n = int(kernels.choose_corners(room, total, reach, cell, apart, _PUSHED * need, place, outward))
+    return place[:n], outward[:n]
+
+
+def _passages(grid: VoronoiGrid, need: float, edge: I32, chain: I32, first: I32) -> I32:
+    """Cells [row, col] along the middle of narrow passages."""
+    field, wide2 = grid.field, (need + max(_NARROW * need, _NARROW_CELLS)) ** 2
+    step = max(min(int(_STEP * need), _STEP_MOST), 1)
+    middle = np.empty((1 << 14, 2), dtype=np.int32)
+    while True:
+        n = int(
+            kernels.choose_passages(
+                field.squared, field.site, edge, chain, first, math.ceil(need * need), wide2, step, middle
+            )
+        )
+        if n <= len(middle):
+            return middle[:n]
+        middle = np.empty((n, 2), dtype=np.int32)
