@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bench.planning import CELL_M, office
+from bench.plans import CELL_M, office
 from mapping.hybrid.planner import Planner
 from mapping.hybrid.rooms import find_rooms
 from mapping.hybrid.voronoi import VoronoiGrid
