@@ -2,9 +2,10 @@
 
     UMFELD_DATA=... python bench/relocalise_features.py [--json FILE] [--across]
 
-Truth: the corrected paths of the logs (gfs). A scene and a question every 0.4 m or 20 degrees; each question is one
-single scan, without a hint. Figures, over the questions asked from where the place was seen before (a scene was taken
-within 1 m and 45 degrees; also within 2 m and 60), and over the others:
+Truth: the corrected paths of the logs (gfs). A scene and a question every 0.4 m or 20 degrees; each question is asked
+without a hint, by one single scan and by one with the anchors of the last 2 m, joined by the log's odometry. Figures,
+over the questions asked from where the place was seen before (a scene was taken within 1 m and 45 degrees; also within
+2 m and 60), and over the others:
 right    within 0.5 m and 5 degrees of the truth
 wrong    another place was told
 unknown  no place was told
@@ -37,18 +38,21 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from drivers.logs import read_log
+from mapping.features.graph import AnchorGraph
 from mapping.features.scenes import Answer, RecogniseRules, SceneDatabase, Sight, sight_of
+from mapping.features.stretch import Stretch
 from mapping.frames import Pose2, wrap_angle
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
-Posed = tuple[Scan, Pose2]
+Posed = tuple[Scan, Pose2, Pose2]  # scan, truth, odometry
 
 LOGS = ("intel", "fr079")
 SHARE = 0.6
 STEP_M, STEP_RAD = 0.4, math.radians(20.0)
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
 WRONG_SHARE = 0.02
+HOW = ("one scan", "the last 2 m")
 SEEN = {"seen before, 1 m and 45 deg": (1.0, 45.0), "seen before, 2 m and 60 deg": (2.0, 60.0)}
 
 
@@ -63,19 +67,31 @@ def posed_scans(name: str) -> list[Posed]:
             if words and not line.startswith("#"):
                 path[words[0]] = Pose2(*(float(word) for word in words[1:4]))
     return [
-        (Scan(0, 0.0, each.bearing_rad, each.range_m, 0.02, log.range_max_m), path[each.stamp_text])
+        (
+            Scan(0, 0.0, each.bearing_rad, each.range_m, 0.02, log.range_max_m),
+            path[each.stamp_text],
+            Pose2(*(float(v) for v in each.laser_pose)),
+        )
         for each in log.scans
         if each.stamp_text in path
     ]
 
 
-def spaced(scans: list[Posed]) -> Iterator[Posed]:
+def spaced(scans: list[Posed]) -> Iterator[tuple[Scan, Pose2]]:
     """Those that are STEP_M or STEP_RAD from the last one."""
+    for scan, pose, _ in stretches(scans):
+        yield scan, pose
+
+
+def stretches(scans: list[Posed]) -> Iterator[tuple[Scan, Pose2, Stretch]]:
+    """The same, with the way there (to be asked at once)."""
     last: Pose2 | None = None
-    for scan, pose in scans:
+    stretch = Stretch(jump_m=math.inf, jump_rad=math.inf)
+    for scan, pose, odometry in scans:
+        stretch.take(scan, odometry)
         if last is None or distance(pose, last) >= STEP_M or abs(wrap_angle(pose.yaw_rad - last.yaw_rad)) >= STEP_RAD:
             last = pose
-            yield scan, pose
+            yield scan, pose, stretch
 
 
 def distance(a: Pose2, b: Pose2) -> float:
@@ -90,8 +106,8 @@ def remembered(scans: list[Posed]) -> SceneDatabase:
     return database
 
 
-def outcome(database: SceneDatabase, sight: Sight, truth: Pose2) -> str:
-    place = database.where_am_i(sight).place
+def outcome(database: SceneDatabase, sight: Sight, truth: Pose2, on_the_way: AnchorGraph | None = None) -> str:
+    place = database.where_am_i(sight, on_the_way=on_the_way).place
     return "unknown" if place is None else judged(place.map_from_sensor, truth)
 
 
@@ -107,29 +123,38 @@ def relocalise(name: str) -> dict[str, Any]:
     scans = posed_scans(name)
     cut = round(SHARE * len(scans))
     database = remembered(scans[:cut])
-    tables = {label: {"right": 0, "wrong": 0, "unknown": 0} for label in (*SEEN, "not seen before")}
-    for scan, pose in spaced(scans[cut:]):
-        told = outcome(database, sight_of(scan), pose)
+    tables = {
+        f"{how}, {label}": {"right": 0, "wrong": 0, "unknown": 0} for how in HOW for label in (*SEEN, "not seen before")
+    }
+    for scan, pose, stretch in stretches(scans[cut:]):
+        sight = sight_of(scan)
+        told = (outcome(database, sight, pose), outcome(database, sight, pose, stretch.graph()))
         place, turn = database.apart(pose)
         seen = [label for label, (m, deg) in SEEN.items() if np.any((place < m) & (turn < math.radians(deg)))]
         for label in seen or ["not seen before"]:
-            tables[label][told] += 1
+            for how, each in zip(HOW, told, strict=True):
+                tables[f"{how}, {label}"][each] += 1
     return {"scenes": len(database), "anchors": database.anchors, "memory_bytes": database.memory_bytes, **tables}
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A question, all that was considered as its answer, and whether the place was seen before (1 m, 45 degrees)."""
+    """A question, all that was considered as its answers, by the way there and by the scan alone, and whether the place
+    was seen before (1 m, 45 degrees)."""
 
     truth: Pose2
-    answer: Answer
+    answers: tuple[Answer, Answer]
     seen: bool
 
     def outcome(self, rules: RecogniseRules) -> str:
-        """As `outcome`, had the answer been given by these rules: least_score, least_lead and least_partners."""
-        if not self.answer.candidates:
+        """As `outcome`, had the answers been given by these rules: least_score, least_lead and least_partners."""
+        first, second = (self._outcome(answer, rules) for answer in self.answers)
+        return second if first == "unknown" else first
+
+    def _outcome(self, answer: Answer, rules: RecogniseRules) -> str:
+        if not answer.candidates:
             return "unknown"
-        best, *others = self.answer.candidates
+        best, *others = answer.candidates
         place = best.map_from_sensor
         rivals = [
             each.score
@@ -149,10 +174,12 @@ def asked(name: str) -> list[Asked]:
     database = remembered(scans[:cut])
     within_m, within_deg = next(iter(SEEN.values()))
     found = []
-    for scan, pose in spaced(scans[cut:]):
+    for scan, pose, stretch in stretches(scans[cut:]):
         place, turn = database.apart(pose)
         seen = bool(np.any((place < within_m) & (turn < math.radians(within_deg))))
-        found.append(Asked(pose, database.where_am_i(sight_of(scan)), seen))
+        sight = sight_of(scan)
+        by_the_way = database.where_am_i(replace(sight, graph=stretch.graph()))
+        found.append(Asked(pose, (by_the_way, database.where_am_i(sight)), seen))
     return found
 
 
@@ -271,7 +298,7 @@ def main() -> None:
     report: dict[str, Any] = {name: relocalise(name) for name in LOGS}
     for name in LOGS:
         print(f"{name}: {report[name]['scenes']} scenes, {report[name]['anchors']} anchors")
-        for label in (*SEEN, "not seen before"):
+        for label in (f"{how}, {each}" for how in HOW for each in (*SEEN, "not seen before")):
             counts = report[name][label]
             total = sum(counts.values())
             shares = ", ".join(f"{key} {n} ({100 * n / max(total, 1):.1f} %)" for key, n in counts.items())

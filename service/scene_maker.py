@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.features.scenes import Answer, Candidate, SceneDatabase, sight_of
+from mapping.features.stretch import Stretch
 from mapping.frames import Pose2, wrap_angle
 from mapping.lines.extract import are_in_order
 from mapping.scan import Scan, seen_from
@@ -27,7 +28,7 @@ _HEAD_TILE: Final = (0, 0)  # how many scenes there are; scene n is tile (n, 1)
 
 class SceneMaker:
     """A SceneDatabase as a map maker: a sweep becomes a scene where the laser has come to a new place, and the newest
-    sweep of each laser is kept to answer where the robot is."""
+    sweeps of each laser are kept to answer where the robot is."""
 
     def __init__(
         self,
@@ -47,7 +48,7 @@ class SceneMaker:
         self._step_m, self._step_rad = step_m, step_rad
         self.database = SceneDatabase(most=most)
         self._last: dict[str, Pose2] = {}
-        self._newest: dict[str, Scan] = {}
+        self._stretches: dict[str, Stretch] = {}
         self._newest_source = ""
         self._version, self._told_version = 0, 0
         self._kept, self._kept_version = 0, 0
@@ -66,7 +67,8 @@ class SceneMaker:
         still = scan if len(poses) == 1 else _as_seen_from(middle, scan, poses)
         if still is None or not are_in_order(still.bearing_rad):  # kept in few bits, or turned fast
             return
-        self._newest[source], self._newest_source = still, source
+        self._stretches.setdefault(source, Stretch()).take(still, middle)
+        self._newest_source = source
         if self._has_moved(source, middle) and not self.database.covers(middle):
             self._last[source] = middle
             sight = sight_of(still)
@@ -85,7 +87,7 @@ class SceneMaker:
         return [DocumentOut(KEY, view.stamp_ns, self._fields())]
 
     def where_am_i(self, arguments: Mapping[str, Any]) -> dict[str, object]:
-        """The answer to `@rpc/where_am_i`, of the newest sweep.
+        """The answer to `@rpc/where_am_i`, of the newest sweep and the anchors of the last metres.
 
         arguments: {"laser": NAME} to ask by one of several; {"skip_newest": N}: so many of the newest scenes do not
         count (SKIP_NEWEST), as a robot that was carried away has just put them at wrong poses.
@@ -97,14 +99,15 @@ class SceneMaker:
         source = arguments.get("laser", self._newest_source)
         if not isinstance(source, str) or (source and source not in self.sources):
             raise CallRefused(f"no laser {source!r} feeds the scenes; there are {', '.join(sorted(self.sources))}")
-        scan = self._newest.get(source)
-        if scan is None:
+        stretch = self._stretches.get(source)
+        sight = None if stretch is None else stretch.sight()
+        if stretch is None or sight is None:
             raise CallRefused("no scan has come yet: a laser must run, and odometry with it")
-        sight = sight_of(scan)
-        answer = self.database.where_am_i(sight, skip_newest=skip)
+        graph = stretch.graph()
+        answer = self.database.where_am_i(sight, on_the_way=graph, skip_newest=skip)
         return answer_fields(answer, self._base_from_laser[source].inverse()) | {
             "laser": source,
-            "anchors": len(sight.graph),
+            "anchors": len(graph),
             "scenes": len(self.database),
         }
 
@@ -133,6 +136,8 @@ class SceneMaker:
         """Forget the scenes: the map was corrected or replaced. The newest sweeps stay, they say what is seen now."""
         self.database = SceneDatabase(self.database.rules, most=self.database.most)
         self._last.clear()
+        for stretch in self._stretches.values():
+            stretch.begin_anew()
         self._kept, self._left_out = 0, 0
         self._version += 1
 

@@ -297,9 +297,11 @@ class SceneDatabase:
         distance = SCENE_FEATURES.distance(self._vectors[: len(self)], vector)
         return [(int(k), float(distance[k])) for k in np.argsort(distance, kind="stable")[:most]]
 
-    def where_am_i(self, sight: Sight, *, skip_newest: int = 0) -> Answer:
+    def where_am_i(self, sight: Sight, *, on_the_way: AnchorGraph | None = None, skip_newest: int = 0) -> Answer:
         """From where a sight was seen, without a hint.
 
+        on_the_way: anchors seen on the last metres, the sight's among them, in its frame (mapping.features.stretch).
+        They are asked first, then those of the sight alone; what they propose is proved by the sight's points.
         skip_newest: so many of the newest scenes are not looked at. A robot that was carried away puts what it sees now
         at wrong poses, which must not vouch for themselves.
 
@@ -311,10 +313,18 @@ class SceneDatabase:
         count = len(self) - skip_newest
         if count <= 0:
             return Answer(None, (), "no scenes are stored yet")
-        if len(sight.graph) < 2:
-            return Answer(None, (), f"too few anchor points: {len(sight.graph)}")
+        answer = self._answer(sight, sight.graph if on_the_way is None else on_the_way, count)
+        if answer.place is None and on_the_way is not None:
+            alone = self._answer(sight, sight.graph, count)
+            return answer if alone.place is None else alone
+        return answer
+
+    def _answer(self, sight: Sight, graph: AnchorGraph, count: int) -> Answer:
+        """By the places that a graph proposes."""
+        if len(graph) < 2:
+            return Answer(None, (), f"too few anchor points: {len(graph)}")
         arrays = self._views.arrays()
-        proposed = self._places(sight.graph, count)
+        proposed = self._places(graph, count)
         places = [(self._glance(sight, arrays, scene, at), scene, n, at) for scene, n, at in proposed]
         places.sort(key=lambda place: -place[0])
         good = [place for place in places[: self.rules.most_matched] if place[0] > places[0][0] - _GLANCE_MARGIN]
