@@ -2,7 +2,8 @@
 
 A leaf is all free, all occupied or all unknown. A cell that is neither for sure (partly free) is unknown here, as in
 picture files. Walls and the rim of what was seen cost nodes, rooms and the unknown outside nearly none: a real map has
-less than a twentieth of its cells in nodes. Cells follow mapping.grids.geometry: [row, col], row with +y.
+less than a twentieth of its cells in divided squares, which are what is kept (16 bytes each). Cells follow
+mapping.grids.geometry: [row, col], row with +y.
 """
 
 from __future__ import annotations
