@@ -11,6 +11,8 @@ Answers do not say what they answer. So a question is put only when nothing is u
 line is held against the form of the answer expected, and after anything odd the talk begins anew: an end of line, `b`,
 and nothing is believed until the line speed has come, which no sonar (cm), input or pair of counts can be mistaken for.
 
+A sketch without `b` answers it by Invalid Command, which is no value either: after 2 s of that it does in its place.
+
 A board starts anew when its port is opened (DTR) and is deaf for 1 to 2 s: `b` is repeated until it answers.
 
 This driver only asks: it moves no motor, sets no pin and resets no count.
@@ -47,6 +49,7 @@ from drivers.wheel_counts import WheelCounts
 _MS = 1_000_000
 _HELLO_PERIOD_NS = 250 * _MS
 _OVERDUE_NS = 3_000 * _MS  # a board with a boot loader may need 2 s
+_REFUSED_HELLOS = 8
 _QUIET_NS = 20 * _MS  # after the line speed: answers to earlier, repeated questions come out first
 _GAP_NS = 2 * _MS  # after an answer: what follows it unasked shows that the talk is out of step
 _PATIENCE_NS = 150 * _MS
@@ -215,6 +218,7 @@ class ArduinoBridgeConversation:
         self._buffer = bytearray()
         self._phase = _Phase.HELLO
         self._answered = self._running = self._overdue = False
+        self._refused_hellos, self._hello_refused = 0, False  # in a row; the one under way
         self._connected_ns = now_ns
         self._due_ns = now_ns  # of the next step of the phase
         self._task: _Task | None = None
@@ -233,6 +237,8 @@ class ArduinoBridgeConversation:
             return ()
         if self._phase is _Phase.HELLO:
             self._due_ns = now_ns + _HELLO_PERIOD_NS
+            self._refused_hellos = self._refused_hellos + 1 if self._hello_refused else 0
+            self._hello_refused = False
             self._buffer.clear()
             return (b"\r" + encode_question("b"),)  # the end of line: of whatever the board holds half of
         return (self._ask(now_ns),)
@@ -335,11 +341,14 @@ class ArduinoBridgeConversation:
         return None
 
     def _take_hello(self, numbers: tuple[int, ...] | None, stamp_ns: int) -> None:
-        if is_baud(numbers):
-            assert numbers is not None
+        self._hello_refused = self._hello_refused or numbers is None
+        knows_no_b = numbers is None and self._refused_hellos >= _REFUSED_HELLOS
+        if is_baud(numbers) or knows_no_b:
             self._answered = True
-            self._identity = Identity(model="ros_arduino_bridge", firmware=f"{numbers[0]} bit/s")
+            self._identity = Identity(model="ros_arduino_bridge", firmware=f"{numbers[0]} bit/s" if numbers else "")
             self._phase = _Phase.QUIET
+        if is_baud(numbers):
+            self._refused_hellos, self._hello_refused = 0, False
         if self._phase is _Phase.QUIET:
             self._due_ns = stamp_ns + _QUIET_NS
 

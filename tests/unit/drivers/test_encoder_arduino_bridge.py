@@ -132,6 +132,29 @@ def full() -> ArduinoBridgeConversation:
     return conversation
 
 
+def test_a_sketch_without_b_is_read_after_two_seconds_of_invalid_commands() -> None:
+    conversation, board = full(), Board(knows="epd")
+    found = run(conversation, board, for_ms=6000)
+    assert conversation.state is LinkState.RUNNING
+    assert not [reading for reading in found if reading.stamp_ns < 1900 * MS]
+    assert len(wheels_in(found)) > 80
+    assert conversation.counters.drops == {}
+
+
+def test_a_board_that_knows_b_is_not_believed_without_it() -> None:
+    """However often the talk began anew: its Invalid Command, for the end of line before `b`, is no word for `b`."""
+    conversation, board = full(), Board()
+    run(conversation, board, for_ms=3000)
+    for k in range(12):
+        begin = 3000 + 300 * k
+        list(conversation.receive(b"?\r\n", begin * MS))  # out of step
+        run(conversation, board, from_ms=begin, for_ms=300)
+    board.knows = "epd"
+    list(conversation.receive(b"?\r\n", 7000 * MS))
+    found = run(conversation, board, from_ms=7000, for_ms=1500)
+    assert wheels_in(found) == []
+
+
 def test_everything_is_asked_in_turn_at_its_rate() -> None:
     conversation, board = full(), Board()
 
