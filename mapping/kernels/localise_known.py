@@ -259,69 +259,21 @@ def judge_many(
 
 
 @njit(cache=True, nogil=True)
-def turned_cells(px: Any, py: Any, resolution_m: float, first_rad: float, step_rad: float, cx: Any, cy: Any) -> None:
-    """cx, cy: (T, N) int32 cells of points (N,) seen from the centre of a cell, for T headings."""
-    for t in range(cx.shape[0]):
-        c, s = math.cos(first_rad + t * step_rad), math.sin(first_rad + t * step_rad)
-        for i in range(len(px)):
-            cx[t, i] = math.floor(0.5 + (c * px[i] - s * py[i]) / resolution_m)
-            cy[t, i] = math.floor(0.5 + (s * px[i] + c * py[i]) / resolution_m)
-
-
-@njit(cache=True, nogil=True)
-def sum_under(raster: Any, cx: Any, cy: Any, u0: int, v0: int) -> int:
-    """Sum of a uint8 raster under cells shifted by u0, v0; outside counts nothing."""
-    height, width = raster.shape
-    total = 0
-    for i in range(len(cx)):
-        u, v = cx[i] + u0, cy[i] + v0
-        if u >= 0 and v >= 0 and u < width and v < height:
-            total += raster[v, u]
-    return total
-
-
-@njit(cache=True, nogil=True)
-def block_bounds(coarse: Any, block: int, blocks: Any, cx: Any, cy: Any, bounds: Any) -> None:
-    """bounds: (T, B) int32, what no pose in block b (rows of (row, col) of blocks) at heading t can exceed."""
-    for t in range(cx.shape[0]):
-        for b in range(len(blocks)):
-            bounds[t, b] = sum_under(coarse, cx[t], cy[t], blocks[b, 1] * block, blocks[b, 0] * block)
-
-
-@njit(cache=True, nogil=True)
-def best_in_blocks(
-    fine: Any, middle: Any, inner: int, block: int, allowed: Any, blocks: Any, cx: Any, cy: Any, bounds: Any,
-    order: Any, share: float, sector: int, most: int, best: Any, where: Any,
-) -> tuple[int, int]:  # fmt: skip
-    """Look into blocks in the given order, as long as their bounds reach `share` of the best score found.
-
-    best: (T / sector, B) int32, gets the best score of each block and sector of headings; where: (T / sector, B, 3)
-    its heading, row, col.
-
-    middle: raster pooled over inner x inner cells.  allowed: (H, W) cells where a robot may stand.
-    most: so many blocks are looked into.  Returns the best score, and the number of blocks looked into.
-    """
-    count = len(blocks)
-    top, looked = 0, 0
-    for n in range(len(order)):
-        t, b = order[n] // count, order[n] % count
-        if bounds[t, b] < share * top or looked >= most:
+def apart(poses: Any, metres: float, radians: float, kept: Any) -> int:
+    """kept: gets the rows of poses (K, 3), best first, that lie so far from every one kept before, as many as it holds;
+    returns how many there are."""
+    count = 0
+    for row in range(len(poses)):
+        if count == len(kept):
             break
-        looked += 1
-        v0, u0 = blocks[b, 0] * block, blocks[b, 1] * block
-        k = t // sector
-        for v in range(v0, v0 + block, inner):
-            for u in range(u0, u0 + block, inner):
-                floor = max(np.int64(best[k, b]), np.int64(share * top))
-                if sum_under(middle, cx[t], cy[t], u, v) <= floor:
-                    continue
-                for vv in range(v, v + inner):
-                    for uu in range(u, u + inner):
-                        if vv >= allowed.shape[0] or uu >= allowed.shape[1] or not allowed[vv, uu]:
-                            continue
-                        score = sum_under(fine, cx[t], cy[t], uu, vv)
-                        if score > best[k, b]:
-                            best[k, b] = score
-                            where[k, b, 0], where[k, b, 1], where[k, b, 2] = t, vv, uu
-                            top = max(top, score)
-    return top, looked
+        alone = True
+        for n in range(count):
+            dx, dy = poses[kept[n], 0] - poses[row, 0], poses[kept[n], 1] - poses[row, 1]
+            turned = abs(poses[kept[n], 2] - poses[row, 2]) % (2.0 * math.pi)
+            if math.hypot(dx, dy) < metres and min(turned, 2.0 * math.pi - turned) < radians:
+                alone = False
+                break
+        if alone:
+            kept[count] = row
+            count += 1
+    return count

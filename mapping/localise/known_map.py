@@ -24,6 +24,8 @@ from mapping.frames import Pose2, wrap_angle, wrap_angles
 from mapping.grids.clearance import DistanceField, squared_cell_distances
 from mapping.grids.patch import GridPatch
 from mapping.kernels import localise_known as kernels
+from mapping.kernels import localise_known_search as search
+from mapping.kernels.localise_known_search import BLOCK
 from mapping.kernels.localise_search import pool
 
 Bools = NDArray[np.bool_]
@@ -32,6 +34,7 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
+U64 = NDArray[np.uint64]
 Scalar = TypeVar("Scalar", np.float32, np.bool_)
 
 WALL_FROM_PERCENT = 65
@@ -40,8 +43,8 @@ REACH_M = 0.8  # surfaces farther from a point are none of its partners
 SURFACE_M = 0.2  # cells this near make a wall cell's line
 SEARCH_RESOLUTION_M = 0.1
 SEARCH_SIGMA_M = 0.15
-BLOCK, INNER = 8, 2
 FARTHEST_M = 20.0
+SEARCH_MARGIN_M = 26.0  # points of joined scans that lie farther from the robot are not searched by
 BEAMS = 90  # of a sweep are used: more say little more, and cost
 MOST_CELLS = 40_000_000
 
@@ -64,9 +67,9 @@ class KnownMap:
 
     (x0_m, y0_m): the lower left corner in the map frame, resolution_m the cell's side.  kind: (R, C) uint8 unknown,
     free, wall.  room_m: (R, C) distance to what is not free.  nearest: (R, C) which surface is nearest, -1 none within
-    REACH_M.  surface: (W, 5) as kernels.surfaces makes it.  fine, middle, coarse: (H, V) likelihoods for the search in
-    cells of search_m from (search_x0_m, search_y0_m) on.  allowed: (H, V) where a robot may stand.  blocks: (B, 2).
-    digest: sha256 of the grid it was made from.
+    REACH_M.  surface: (W, 5) as kernels.surfaces makes it.  fine: likelihoods for the search, in cells of search_m from
+    (search_x0_m, search_y0_m) on, (H, V) laid out by in_words; coarse: their maxima over blocks, laid out by in_phases.
+    allowed: (H, V) where a robot may stand.  blocks: (B, 2).  digest: sha256 of the grid it was made from.
     """
 
     resolution_m: float
@@ -79,8 +82,7 @@ class KnownMap:
     search_m: float
     search_x0_m: float
     search_y0_m: float
-    fine: U8
-    middle: U8
+    fine: U64
     coarse: U8
     allowed: Bools
     blocks: I64
@@ -118,11 +120,12 @@ def known_map(patch: GridPatch) -> KnownMap:
     kernels.surfaces(np.where(wall, cells, 0).astype(np.uint8), wall, max(1, round(SURFACE_M / r)), r, surface)
     x0, y0 = (patch.col0 - 1) * r, (patch.row0 - 1) * r
     step = max(1, round(SEARCH_RESOLUTION_M / r))
-    fine, allowed = _search_rasters(squared, free, r, step)
+    margin = BLOCK * math.ceil(SEARCH_MARGIN_M / (BLOCK * step * r))
+    fine, allowed = _search_rasters(squared, free, r, step, margin)
     return KnownMap(
         r, x0, y0, kind, room, nearest, surface,
-        step * r, x0 - BLOCK * step * r, y0 - BLOCK * step * r,
-        fine, pool(fine, INNER, 1), pool(fine, BLOCK, 1), allowed, _blocks_with(allowed), digest_of(patch),
+        step * r, x0 - margin * step * r, y0 - margin * step * r,
+        search.in_words(fine), search.in_phases(pool(fine, BLOCK, 1)), allowed, _blocks_with(allowed), digest_of(patch),
     )  # fmt: skip
 
 
@@ -135,13 +138,14 @@ def _nearest_walls(wall: Bools, reach_cells: float) -> tuple[I32, I32]:
     return field.squared, nearest
 
 
-def _search_rasters(squared: I32, free: Bools, resolution_m: float, step: int) -> tuple[U8, Bools]:
-    """Likelihoods and standing room in cells of step x step, with a margin of blocks that pooling may look into."""
+def _search_rasters(squared: I32, free: Bools, resolution_m: float, step: int, margin: int) -> tuple[U8, Bools]:
+    """Likelihoods and standing room in cells of step x step, with so many cells around that no point lies outside, and
+    to whole blocks."""
     likely = np.exp(-0.5 * squared.astype(np.float32) * np.float32((resolution_m / SEARCH_SIGMA_M) ** 2))
     fine = np.asarray(255.0 * _coarser(likely, step), dtype=np.uint8)
     allowed = _coarser(free, step)
-    margin = ((BLOCK, BLOCK + BLOCK), (BLOCK, BLOCK + BLOCK))
-    return np.pad(fine, margin), np.pad(allowed, margin)
+    around = [(margin, margin + BLOCK + -n % BLOCK) for n in fine.shape]
+    return np.pad(fine, around), np.pad(allowed, around)
 
 
 def _coarser(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
@@ -302,22 +306,24 @@ def find_places(
     step = 2.0 * math.pi / turns
     sector = max(1, round(math.radians(12.0) / step))
     blocks = known.blocks if near is None else _blocks_near(known, *near)
+    points = points[np.hypot(points[:, 0], points[:, 1]) <= SEARCH_MARGIN_M - known.search_m]
+    if len(points) > search.MOST_POINTS:
+        points = points[np.linspace(0, len(points) - 1, search.MOST_POINTS).astype(np.int64)]
     if not len(blocks) or not len(points):
         return Places(np.zeros((0, 3)), np.zeros(0))
     px, py = (np.ascontiguousarray(v) for v in points.T)
     cx, cy = np.empty((turns, len(px)), dtype=np.int32), np.empty((turns, len(px)), dtype=np.int32)
-    kernels.turned_cells(px, py, known.search_m, 0.0, step, cx, cy)
-    bounds = np.empty((turns, len(blocks)), dtype=np.int32)
-    kernels.block_bounds(known.coarse, BLOCK, blocks, cx, cy, bounds)
+    search.turned_cells(px, py, known.search_m, step, cx, cy)
+    bounds = np.empty((turns, len(blocks)), dtype=np.uint16)
+    search.block_bounds(known.coarse, blocks, cx, cy, bounds)
     flat = bounds.ravel()
     likely = np.flatnonzero(flat >= share * 0.5 * flat.max())
-    order = likely[np.argsort(-flat[likely], kind="stable")]
+    order = likely[np.argsort(flat.max() - flat[likely], kind="stable")]
     best = np.zeros((math.ceil(turns / sector), len(blocks)), dtype=np.int32)
     where = np.zeros((*best.shape, 3), dtype=np.int32)
-    top, _ = kernels.best_in_blocks(
-        known.fine, known.middle, INNER, BLOCK, known.allowed, blocks, cx, cy, bounds, order,
-        share, sector, most_blocks, best, where,
-    )  # fmt: skip
+    top, _ = search.best_in_blocks(
+        known.fine, known.allowed, blocks, cx, cy, bounds, order, share, sector, most_blocks, best, where
+    )
     ranked = np.flatnonzero(best.ravel() >= max(1.0, share * top))
     ranked = ranked[np.argsort(-best.ravel()[ranked], kind="stable")]
     at = where.reshape(-1, 3)[ranked]
@@ -342,16 +348,8 @@ def _blocks_near(known: KnownMap, pose: Pose2, radius_m: float) -> I64:
 
 def apart(poses: F64, *, metres: float, radians: float, most: int) -> I64:
     """Rows of poses (K, 3), best first, that lie so far from every better one; at most `most`."""
-    kept: list[int] = []
-    for row in range(len(poses)):
-        if len(kept) >= most:
-            break
-        others = poses[kept]
-        close = np.hypot(others[:, 0] - poses[row, 0], others[:, 1] - poses[row, 1]) < metres
-        turned = np.abs(wrap_angles(others[:, 2] - poses[row, 2])) < radians
-        if not np.any(close & turned):
-            kept.append(row)
-    return np.array(kept, dtype=np.int64)
+    kept = np.empty(min(most, len(poses)), dtype=np.int64)
+    return kept[: kernels.apart(np.ascontiguousarray(poses), metres, radians, kept)]
 
 
 def pose_of(row: F64) -> Pose2:

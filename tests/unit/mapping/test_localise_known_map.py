@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from mapping.frames import Pose2, wrap_angle
 from mapping.grids.patch import GridPatch
 from mapping.kernels import localise_known as kernels
+from mapping.kernels import localise_known_search as kernels_search
+from mapping.kernels.localise_known_search import BLOCK
 from mapping.localise.in_map import (
     InMapSettings,
     Located,
@@ -33,7 +35,6 @@ from mapping.localise.in_map import (
 )
 from mapping.localise.known_map import (
     BEAMS,
-    BLOCK,
     LOG_APART,
     LOG_ELSE,
     KnownMap,
@@ -48,6 +49,7 @@ from mapping.localise.known_map import (
 )
 
 F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
 
 WALLS: F64 = np.array(
     [
@@ -265,17 +267,15 @@ def test_search_finds_what_a_literal_search_finds() -> None:
     points = thinned(np.stack(_xy(points_at(Pose2(3.05, 2.55, 1.0))), axis=-1), cell_m=0.3, most=40)
     step = math.radians(10.0)
     places = find_places(known, points, turn_step_rad=step, share=0.6)
-    best, where = -1.0, (0.0, 0.0, 0.0)
+    best, where, fine = -1.0, (0.0, 0.0, 0.0), likelihoods(known)
     rows, cols = np.nonzero(known.allowed)
     for t in range(36):
         c, s = math.cos(t * step), math.sin(t * step)
         u = np.floor(0.5 + (c * points[:, 0] - s * points[:, 1]) / 0.1).astype(int)
         v = np.floor(0.5 + (s * points[:, 0] + c * points[:, 1]) / 0.1).astype(int)
         uu, vv = cols[:, None] + u, rows[:, None] + v
-        inside = (uu >= 0) & (vv >= 0) & (uu < known.fine.shape[1]) & (vv < known.fine.shape[0])
-        values = np.where(
-            inside, known.fine[np.clip(vv, 0, known.fine.shape[0] - 1), np.clip(uu, 0, known.fine.shape[1] - 1)], 0
-        )
+        inside = (uu >= 0) & (vv >= 0) & (uu < fine.shape[1]) & (vv < fine.shape[0])
+        values = np.where(inside, fine[np.clip(vv, 0, fine.shape[0] - 1), np.clip(uu, 0, fine.shape[1] - 1)], 0)
         scores = values.astype(int).sum(axis=1)
         if scores.max() > best:
             k = int(scores.argmax())
@@ -286,11 +286,43 @@ def test_search_finds_what_a_literal_search_finds() -> None:
     assert np.all(np.diff(places.score) <= 1e-12)
 
 
+def likelihoods(known: KnownMap) -> U8:
+    """The raster of a search as rows and columns: words of phase 0 side by side."""
+    return np.asarray(known.fine[0].astype("<u8").view(np.uint8))
+
+
 def test_pooled_likelihoods_bound_every_block(rooms: KnownMap) -> None:
-    rng = np.random.default_rng(5)
-    for _ in range(200):
-        v, u = (int(rng.integers(0, n - BLOCK)) for n in rooms.fine.shape)
-        assert rooms.coarse[v, u] == rooms.fine[v : v + BLOCK, u : u + BLOCK].max()
+    rng, fine = np.random.default_rng(5), likelihoods(rooms)
+    assert fine.max() == 255
+    for _ in range(500):
+        v, u = (int(rng.integers(0, n - BLOCK)) for n in fine.shape)
+        pooled = rooms.coarse[v % BLOCK, u % BLOCK, v // BLOCK, u // BLOCK]
+        assert pooled == fine[v : v + BLOCK, u : u + BLOCK].max()
+
+
+def test_eight_poses_at_once_score_as_one_by_one(rooms: KnownMap) -> None:
+    """As many points as fit, most of them on walls: the sums in 16 bits hold."""
+    rng, fine = np.random.default_rng(6), likelihoods(rooms)
+    v0, u0 = (int(v) * BLOCK for v in rooms.blocks[len(rooms.blocks) // 2])
+    rows, cols = np.nonzero(fine > 200)
+    chosen = rng.integers(0, len(rows), kernels_search.MOST_POINTS)
+    cx, cy = cols[chosen] - u0 - 3, rows[chosen] - v0 - 5
+    high, wide = rooms.fine.shape[1:]
+    offset = ((cx % BLOCK) * high + cy) * wide + cx // BLOCK
+    scores = np.empty((BLOCK, BLOCK), dtype=np.int32)
+    kernels_search.block_scores(rooms.fine.ravel(), wide, v0 * wide + u0 // BLOCK, offset, scores)
+    assert scores[5, 3] == fine[rows[chosen], cols[chosen]].astype(int).sum() > 200 * len(cx)
+    for v in range(BLOCK):
+        for u in range(BLOCK):
+            assert scores[v, u] == fine[v0 + v + cy, u0 + u + cx].astype(int).sum()
+
+
+def test_a_point_farther_than_the_margin_is_left_out(rooms: KnownMap) -> None:
+    points = np.stack(_xy(points_at(Pose2(3.0, 4.5, 0.0))), axis=-1)
+    far = np.array([[1e4, 0.0], [-26.5, 0.0], [0.0, 27.0]])
+    plain, more = find_places(rooms, points), find_places(rooms, np.concatenate((points, far)))
+    assert np.array_equal(plain.poses, more.poses)
+    assert not len(find_places(rooms, far).poses)
 
 
 def test_a_hint_keeps_the_search_near(rooms: KnownMap) -> None:
