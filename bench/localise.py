@@ -2,6 +2,7 @@
 
     UMFELD_DATA=folder .venv/bin/python bench/localise.py [--starts 200] [--kidnaps 40] [--cases fr079-2 wean3 ...]
         [--seed 7] [--no-tracking] [--fit] [--json FILE] [--picture FILE]
+    .venv/bin/python bench/localise.py --drawn FILE [FILE ...] --picture FILE
 
 Cases: LOG-1 is the first half of a log played in a map of its second half, LOG-2 the second half in a map of the first;
 maps and truth are by SLAM over the whole log, so both halves lie in one frame. wean1, wean3 are Wean Hall's logs in the
@@ -10,8 +11,9 @@ measurement. Starts are random moments from which the robot drives for 10 s (sta
 that the map shows. Kidnapping: 20 s of driving, then 20 s from another place, the wheels feeling nothing; every other
 time the robot stands there for 3 s first.
 
-Starts of one seed are always the same; --seed draws others, to judge what was chosen on the first. A case takes about
-1.5 s of one core a start and 10 s a jump; several cases may be run side by side.
+Starts and jumps of one seed are always the same; --seed draws others, to judge what was chosen on the first. A case
+takes about half a second of one core a start and 2 s a jump; several cases may be run side by side, each with a --json
+of its own, and --drawn draws the reliability diagram of such files.
 
 --fit fits the coefficients of mapping/localise/confidence.py on fr079-2, intel-2 and wean1 and prints them; the others
 are held back.
@@ -48,6 +50,7 @@ ALL = ("fr079-1", "fr079-2", "intel-1", "intel-2", "wean1", "wean3")
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(10.0)
 WEAN_START = Pose2(44.75, 15.65, -1.54)
 FEW = 10
+CERTAIN = 0.95
 WRONG_COUNTS = 2.0  # a right place that is doubted costs a moment, a wrong one that is believed more
 BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 1.001)
 
@@ -109,7 +112,7 @@ def _grid(log: Log, poses: F64, first: int, last: int) -> OccupancyGrid:
 
 def _tracked(case: Case) -> F64:
     """The way from the known start, rivals kept out."""
-    quiet = InMapSettings(carried=60.0, unsure=-1.0, sure=-1.0)
+    quiet = InMapSettings(carried=60.0, unsure=-1.0, stays=-1.0, sure=-1.0)
     if case.name == "wean3":
         quiet = InMapSettings(search_s=1e9, search_sure_s=1e9)
     played = play(case, range(case.first, case.last), settings=quiet, start=WEAN_START)
@@ -255,9 +258,9 @@ def tracking(case: Case) -> dict[str, object]:
     }  # fmt: skip
 
 
-def kidnapping(case: Case, count: int, samples: list[Sample]) -> dict[str, object]:
+def kidnapping(case: Case, count: int, samples: list[Sample], *, seed: int = 11) -> dict[str, object]:
     """Jumps of robots that were sure and right: how long still sure of the wrong place, and when sure of the right."""
-    pieces = starts_of(case, 4 * count, 20.0, seed=11)
+    pieces = starts_of(case, 4 * count, 20.0, seed=seed)
     wrong_s: list[float] = []
     longest_s: list[float] = []
     back_s: list[float] = []
@@ -314,6 +317,16 @@ def reliability(samples: list[Sample]) -> list[tuple[float, float, int]]:
     return rows
 
 
+def told(samples: list[Sample]) -> dict[str, float]:
+    """How the probability does over all samples: Brier score, and what is told as almost certain."""
+    p, right = np.array([s[3] for s in samples]), np.array([s[2] for s in samples], dtype=float)
+    certain = p >= CERTAIN
+    return {
+        "brier": round(float(np.mean((p - right) ** 2)), 3), "certain_share": round(float(certain.mean()), 3),
+        "wrong_of_certain": round(float(1.0 - right[certain].mean()), 4) if certain.any() else 0.0,
+    }  # fmt: skip
+
+
 def fitted(samples: list[Sample]) -> Coefficients:
     """Coefficients of least cross entropy, a little shrunk; wrong places count more than right ones."""
     from scipy.optimize import minimize
@@ -360,7 +373,12 @@ def main() -> None:
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--drawn", nargs="+", type=Path, help="reports that --json wrote: draw these, measure nothing")
     asked = parser.parse_args()
+    if asked.drawn is not None:
+        kept = {name: each for path in asked.drawn for name, each in json.loads(path.read_text()).items()}
+        draw({name: kept[name]["reliability"] for name in ALL if name in kept}, asked.picture)
+        return
     report: dict[str, dict[str, object]] = {}
     samples: dict[str, list[Sample]] = {}
     for case in cases_of(asked.cases, Path(os.environ["UMFELD_DATA"])):
@@ -368,7 +386,8 @@ def main() -> None:
         report[case.name] = {
             **({} if asked.no_tracking else {"tracking": tracking(case)}),
             "start": global_starts(case, asked.starts, seen, seed=asked.seed),
-            "kidnapping": kidnapping(case, asked.kidnaps, seen),
+            "kidnapping": kidnapping(case, asked.kidnaps, seen, seed=asked.seed + 4),
+            "told": told(seen) if seen else {},
             "reliability": reliability(seen),
         }
         print(case.name, json.dumps(report[case.name]), flush=True)

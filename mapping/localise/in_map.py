@@ -9,8 +9,8 @@ back through the window, so that old and new places are judged by the same scans
 
 How probable it is that the first place is right follows from its lead over others and from how well scans fit it
 (`confidence`), fitted on recorded logs.
-Above settings.sure it is "sure", until it falls below settings.unsure; what was believed and is not any
-more is "lost"; in between it is "searching".
+From settings.sure on it is "sure", until it falls below settings.unsure or has not reached settings.stays
+for grace_s; what was believed and is not any more is "lost"; before, it is "searching".
 
 Threads: none of ours. As with SLAM, a search is handed out as a piece of work that may run anywhere and whose result
 is applied at a moment that stamps alone decide:
@@ -65,8 +65,8 @@ class InMapSettings:
     been carried away, see `_Crowd.weight`; also what a new place must make good against one that is sure.  doubted: the
     same against one that was sure until it was lost.
     search_*: from one search to the next while not sure, and while sure.  joined_m: way over which key scans are joined
-    for a search.  point_sigma_m, floor_*: see `_corrected`.  odometry_*: standard deviations of a step.  sure, unsure:
-    see the module.
+    for a search.  point_sigma_m, floor_*: see `_corrected`.  odometry_*: standard deviations of a step.  sure, stays,
+    grace_s, unsure: see the module.
     """
 
     key_m: float = 0.2
@@ -96,7 +96,9 @@ class InMapSettings:
     odometry_turn_share: float = 0.08
     odometry_rad_per_m: float = math.radians(2.0)
     least_points: int = 12
-    sure: float = 0.95
+    sure: float = 0.97
+    stays: float = 0.95
+    grace_s: float = 2.0
     unsure: float = 0.7
     search_points: int = 120
 
@@ -272,6 +274,7 @@ class MapLocaliser:
         self._doubted: int | None = None  # the key scan at which a place that was sure became lost
         self._hint: tuple[Pose2, float] | None = None
         self._probability = 0.0
+        self._sure_ns = 0  # when the probability last reached settings.stays
         self._evidence = Evidence()
         if start is not None:
             self._begin_at(start, start_sigma_m)
@@ -367,11 +370,12 @@ class MapLocaliser:
         s = self.settings
         self._evidence = self._weigh()
         self._probability = probability(self._evidence)
-        before = self.state
-        if self._probability >= s.sure:
+        before, now_ns = self.state, self._last_ns if self._last_ns is not None else 0
+        if self._probability >= (s.stays if before is State.SURE else s.sure):
             self.state = State.SURE
             self._doubted = None
-        elif before is State.SURE and self._probability < s.unsure:
+            self._sure_ns = now_ns
+        elif before is State.SURE and (self._probability < s.unsure or now_ns - self._sure_ns >= s.grace_s * 1e9):
             self.state = State.LOST
             self.events["lost"] += 1
             self._look_anew()
@@ -403,7 +407,7 @@ class MapLocaliser:
             return
         s = self.settings
         if self._searched_ns is not None:
-            calm = self.state is State.SURE and self._probability >= s.sure
+            calm = self.state is State.SURE and self._probability >= s.stays
             if (stamp_ns - self._searched_ns) * 1e-9 < (s.search_sure_s if calm else s.search_s):
                 return
         floor = self.known.floor_m2 if self._hint is None else min(self.known.floor_m2, 4.0 * self._hint[1] ** 2)
