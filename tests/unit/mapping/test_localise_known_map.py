@@ -455,6 +455,34 @@ def test_what_was_seen_outlasts_a_doubt() -> None:
     assert len(localiser._keys) > 5
 
 
+def test_sure_must_be_earned_and_is_kept_for_a_moment_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Told probabilities, a key scan every half second: in the grey between sure and lost it stays sure for 2 s."""
+    told: dict[str, float] = {}
+    monkeypatch.setattr("mapping.localise.in_map.probability", lambda evidence: told["now"])
+    localiser = MapLocaliser(KNOWN, start=Pose2(3.0, 4.5, 0.0))
+    stamp_ns, states = 0, []
+    points = points_at(Pose2(3.0, 4.5, 0.0))
+    for probability, key_scans in (
+        (0.96, 4),
+        (0.98, 1),
+        (0.96, 8),
+        (0.9, 3),
+        (0.96, 1),
+        (0.9, 4),
+        (0.98, 1),
+        (0.69, 1),
+    ):
+        told["now"] = probability
+        for _ in range(key_scans):
+            if localiser.is_due(stamp_ns):
+                localiser.abandon()
+            states.append(localiser.add_scan(stamp_ns, points, Pose2()).state)
+            stamp_ns += 500_000_000
+    searching, sure, lost = State.SEARCHING, State.SURE, State.LOST
+    assert states == [*[searching] * 4, *[sure] * 16, lost, sure, lost]
+    assert localiser.events["lost"] == 2
+
+
 def test_being_carried_must_be_made_good_once() -> None:
     """Three places and six key scans, the newest first: one was right until four ago, one is since, one is never."""
     s = InMapSettings(window=6, forget=1.0, most_per_key=5.0, carried=7.0)
