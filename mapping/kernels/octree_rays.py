@@ -134,9 +134,10 @@ def start_of(i: Any, origin: Any, scale: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def group_of(voxel: Any, shift: Any, table: Any, groups: Any, members: Any, fans: Any, count: Any) -> Any:
-    """The group of a voxel, an empty one if it is new. shift: 64 less the bits of a place in the table."""
-    at = np.int64((np.uint64(voxel) * np.uint64(0x9E3779B97F4A7C15)) >> shift)
+def group_of(voxel: Any, table: Any, groups: Any, members: Any, fans: Any, count: Any) -> Any:
+    """The group of a voxel, an empty one if it is new."""
+    mixed = (voxel & 0xFFFFFF) * 0x9E3779 + (voxel >> 24) * 0x85EBCB  # below 2^49
+    at = (mixed ^ mixed >> 20) & (table.size - 1)
     group = np.int64(table[at])
     while group >= 0:
         if groups[group] == voxel:
@@ -182,9 +183,6 @@ def mark_ends(
     one_origin, one_hit = origin.shape[0] == 1, is_hit.size == 1
     cx, cy, cz, seen = np.int64(-1), np.int64(-1), np.int64(-1), np.int64(0)
     run, group = np.int64(-1), np.int64(-1)
-    shift = np.uint64(64)
-    while np.int64(1) << (np.uint64(64) - shift) < table.size:
-        shift -= np.uint64(1)
     x0, y0, z0 = start_of(np.int64(0), origin, scale)
     own_x, own_y, own_z = np.int64(0), np.int64(0), np.int64(0)
     if one_origin:
@@ -242,7 +240,7 @@ def mark_ends(
             marks[at + np.uint64(BRICK)] |= bit
         if not same:
             cx, cy, cz, seen = x, y, z, kind
-            group = group_of((z << AXIS_BITS | y) << AXIS_BITS | x, shift, table, groups, members, fans, count)
+            group = group_of((z << AXIS_BITS | y) << AXIS_BITS | x, table, groups, members, fans, count)
             run = count[RUNS]
             count[RUNS] += 1
             runs[run, 0], runs[run, 2] = i, members[group, HEAD]
