@@ -106,7 +106,7 @@ def search(
                 bounds[at] = score_at(top, cells_x[t], cells_y[t], bx * top_block, by * top_block)
                 at += 1
     enough = int(least * 255.0 * count)
-    hopeful = np.flatnonzero(bounds >= floor_share * enough)
+    hopeful = np.flatnonzero(bounds >= min(floor_share, 1.0) * enough)
     order = hopeful[np.argsort(-bounds[hopeful], kind="mergesort")]
     ratio = top_block // block
     # Wide blocks reach beyond the window by up to 3 m: what drift cannot explain must not be found there.

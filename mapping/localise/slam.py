@@ -369,7 +369,7 @@ class Slam:
                 self.events["scan_without_beams"] += 1
                 return None
             self._sensors[sensor] = known
-        view = view_of(scan, known.table, farthest_m=self.settings.farthest_m)
+        view = view_of(scan, known.table, farthest_m=self.settings.farthest_m, grazed=True)
         if view.points < self.settings.least_points:
             self.events["scan_too_empty"] += 1
             return None

@@ -94,8 +94,11 @@ class View:
     normals: int
 
 
-def view_of(scan: Scan, table: BearingTable, *, farthest_m: float) -> View:
-    """A de-skewed sweep as a view: readings from range_min_m to farthest_m; no return and invalid leave bins empty."""
+def view_of(scan: Scan, table: BearingTable, *, farthest_m: float, grazed: bool = False) -> View:
+    """A de-skewed sweep as a view: readings from range_min_m to farthest_m; no return and invalid leave bins empty.
+
+    grazed: walls that beams graze have normals, too.
+    """
     x, y, nx, ny, quality = (np.empty(table.bins, dtype=np.float32) for _ in range(5))
     frame = table.frame()
     farthest = min(farthest_m, scan.range_max_m if scan.range_max_m > 0.0 else farthest_m)
@@ -105,14 +108,14 @@ def view_of(scan: Scan, table: BearingTable, *, farthest_m: float) -> View:
     if bearing.shape != distance.shape or bearing.ndim != 1:
         raise ValueError(f"bearings {bearing.shape} and ranges {distance.shape} of a scan must be rows of one length")
     points = fill_table(bearing, distance, nearest, farthest, frame, x, y, quality)
-    normals = fill_normals(x, y, frame, nx, ny, quality)
+    normals = fill_normals(x, y, frame, nx, ny, quality, grazed=grazed)
     return View(table, x, y, nx, ny, quality, points, normals)
 
 
-def fill_normals(x: F32, y: F32, frame: F64, nx: F32, ny: F32, quality: F32) -> int:
+def fill_normals(x: F32, y: F32, frame: F64, nx: F32, ny: F32, quality: F32, *, grazed: bool = False) -> int:
     """Set normals and quality of a view's points (B,); returns how many have one."""
-    near = surface_normals(x, y, frame, nx, ny, quality, ROUGHNESS_M)
-    return int(near + grazing_normals(x, y, frame, nx, ny, quality))
+    near = int(surface_normals(x, y, frame, nx, ny, quality, ROUGHNESS_M))
+    return near + int(grazing_normals(x, y, frame, nx, ny, quality)) if grazed else near
 
 
 @dataclass(frozen=True, slots=True)

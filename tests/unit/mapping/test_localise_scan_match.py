@@ -128,7 +128,7 @@ def test_a_corridor_seen_every_degree_holds_the_heading() -> None:
     def corridor(yaw: float, seed: int) -> View:
         distance = 1.25 / np.maximum(np.abs(np.sin(bearing + yaw)), 0.02)
         noise = np.random.default_rng(seed).normal(0.0, 0.02, len(bearing))
-        return view_of(Scan(0, 0.0, bearing, distance + noise, 0.05, 20.0), table, farthest_m=20.0)
+        return view_of(Scan(0, 0.0, bearing, distance + noise, 0.05, 20.0), table, farthest_m=20.0, grazed=True)
 
     off = []
     for k in range(30):
