@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 
 TWO_PI = 2.0 * math.pi
+CELL_SLACK_M = 1e-9
 EDGE_RAD = 1e-9  # bearings closer to an edge than this lie on it
 CLEAR_RAD = 1e-7  # bearings farther from an edge than this are surely on its one side
 TOUCH_M = 1e-9  # a shorter stretch is a touch
@@ -498,6 +499,25 @@ def arc_in_sectors(arc: Any, off_axis: Any, edges: Any, width: float, range_max:
 
 
 @njit(cache=True)
+def cells_between(start: float, end: float, edge: float, count: int) -> tuple[int, int]:
+    """First and last cell along an axis that a stretch from start to end touches; the first greater: none."""
+    low, high = min(start, end) - CELL_SLACK_M, max(start, end) + CELL_SLACK_M
+    return max(0, math.floor(low / edge)), min(count - 1, math.floor(high / edge))
+
+
+@njit(cache=True)
+def columns_in_row(
+    ax: float, ay: float, ex: float, ey: float, row: int, edge: float, cols: int
+) -> tuple[float, float, int, int]:
+    """Of a segment from a along e: the stretch of t within a row of cells, and its first and last column there."""
+    t0, t1 = between(ay, ey, row * edge - CELL_SLACK_M, (row + 1) * edge + CELL_SLACK_M)
+    if t0 > t1:
+        return t0, t1, 0, -1
+    low, high = cells_between(ax + t0 * ex, ax + t1 * ex, edge, cols)
+    return t0, t1, low, high
+
+
+@njit(cache=True)
 def line_through_cells(
     line: Any, x0: float, y0: float, edge: float, rows: int, cols: int, polygon: Any, reach: float
 ) -> tuple[Any, Any, Any]:
@@ -509,23 +529,16 @@ def line_through_cells(
     best = np.full((rows, cols), math.inf)
     at_x = np.full((rows, cols), math.nan)
     at_y = np.full((rows, cols), math.nan)
-    slack = 1e-9
     for k in range(len(line) - 1):
         ax, ay, bx, by = line[k, 0] - x0, line[k, 1] - y0, line[k + 1, 0] - x0, line[k + 1, 1] - y0
         ex, ey = bx - ax, by - ay
         if ex == 0.0 and ey == 0.0:
             continue
-        row_lo = max(0, math.floor((min(ay, by) - slack) / edge))
-        row_hi = min(rows - 1, math.floor((max(ay, by) + slack) / edge))
+        row_lo, row_hi = cells_between(ay, by, edge, rows)
         for row in range(row_lo, row_hi + 1):
-            t0, t1 = between(ay, ey, row * edge - slack, (row + 1) * edge + slack)
-            if t0 > t1:
-                continue
-            xa, xb = ax + t0 * ex, ax + t1 * ex
-            col_lo = max(0, math.floor((min(xa, xb) - slack) / edge))
-            col_hi = min(cols - 1, math.floor((max(xa, xb) + slack) / edge))
+            t0, t1, col_lo, col_hi = columns_in_row(ax, ay, ex, ey, row, edge, cols)
             for col in range(col_lo, col_hi + 1):
-                u0, u1 = between(ax, ex, col * edge - slack, (col + 1) * edge + slack)
+                u0, u1 = between(ax, ex, col * edge - CELL_SLACK_M, (col + 1) * edge + CELL_SLACK_M)
                 u0, u1 = max(u0, t0), min(u1, t1)
                 if u0 > u1:
                     continue
@@ -557,26 +570,19 @@ def cells_crossed(
 ) -> Any:
     """(rows, cols) through which cells of a raster the closed polyline (M, 2) passes outside the vehicle's outline."""
     crossed = np.zeros((rows, cols), dtype=np.bool_)
-    slack = 1e-9
     for k in range(len(line)):
         after = k + 1 if k + 1 < len(line) else 0
         ax, ay, bx, by = line[k, 0] - x0, line[k, 1] - y0, line[after, 0] - x0, line[after, 1] - y0
         ex, ey = bx - ax, by - ay
         if ex == 0.0 and ey == 0.0:
             continue
-        row_lo = max(0, math.floor((min(ay, by) - slack) / edge))
-        row_hi = min(rows - 1, math.floor((max(ay, by) + slack) / edge))
+        row_lo, row_hi = cells_between(ay, by, edge, rows)
         for row in range(row_lo, row_hi + 1):
-            t0, t1 = between(ay, ey, row * edge - slack, (row + 1) * edge + slack)
-            if t0 > t1:
-                continue
-            xa, xb = ax + t0 * ex, ax + t1 * ex
-            col_lo = max(0, math.floor((min(xa, xb) - slack) / edge))
-            col_hi = min(cols - 1, math.floor((max(xa, xb) + slack) / edge))
+            t0, t1, col_lo, col_hi = columns_in_row(ax, ay, ex, ey, row, edge, cols)
             for col in range(col_lo, col_hi + 1):
                 if crossed[row, col]:
                     continue
-                u0, u1 = between(ax, ex, col * edge - slack, (col + 1) * edge + slack)
+                u0, u1 = between(ax, ex, col * edge - CELL_SLACK_M, (col + 1) * edge + CELL_SLACK_M)
                 u0, u1 = max(u0, t0), min(u1, t1)
                 if u0 <= u1:
                     px, py = ax + u0 * ex + x0, ay + u0 * ey + y0
