@@ -42,7 +42,7 @@ class CornerGraph:
         self, grid: VoronoiGrid, need: float, room: NDArray[np.uint8], edge: I32, chain: I32, first: I32
     ) -> None:
         """need: clearance in cells.  room: (R, C) from paths.measure_room.  edge, chain, first: of a DiagramGraph."""
-        self._room = room
+        self._room, self._step = room, 0.75 * need
         place, outward = _corners(room, need)
         middle = _passages(grid, need, edge, chain, first)
         place = np.concatenate((place, middle))
@@ -70,7 +70,8 @@ class CornerGraph:
         self._stamp += 2
         n = int(
             kernels.way_round(
-                self._room, self.place, self.outward, self._tile, self._across, self._first, self._other, self._cost,
+                self._room, self.place, self.outward, self._tile, self._across, self._step, self._first,
+                self._other, self._cost,
                 self._mark, begin, end, self._best, self._via, self._state, self._stamp,
                 self._to_go, self._heap, self._key, self._to_end, self._which, self._far, self._point,
                 self._work, _PULLS,
@@ -81,7 +82,9 @@ class CornerGraph:
     def _links(self) -> I32:
         pair = np.empty((8 * len(self.place) + 64, 2), dtype=np.int32)
         while True:
-            m = int(kernels.link_places(self._room, self.place, self.outward, self._tile, self._across, pair))
+            m = int(
+                kernels.link_places(self._room, self.place, self.outward, self._tile, self._across, self._step, pair)
+            )
             if m <= len(pair):
                 return pair[:m].copy()
             pair = np.empty((m, 2), dtype=np.int32)

@@ -23,9 +23,9 @@ from mapping.kernels.paths import _FAR_AWAY, pop, push, sees_by_room, still_to_g
 from mapping.kernels.rooms import critical_line
 
 TILE = 50
-SECTORS = 32
+SECTORS = 64
 _ROUND = 0.9  # a way that comes from straight in front of a corner (cosine above this) need not go round it
-_EAGER = 1.03  # what is still to go counts so much more: fewer places are looked at for a way of about the same length
+_EAGER = 1.02  # what is still to go counts so much more: fewer places are looked at for a way of about the same length
 _FAILS = 12  # so many places of a sector out of sight, and the others are not looked at
 _SLACK, _SLACK_CELLS = 1.1, 10.0  # how much farther than a ray of the sector one looks for places
 
@@ -157,14 +157,15 @@ def choose_passages(
 
 
 @njit(cache=True, nogil=True)
-def ray(room: Any, r: float, c: float, ur: float, uc: float) -> float:
-    """How far open cells go from a place in a direction, about."""
+def ray(room: Any, r: float, c: float, ur: float, uc: float, step: float) -> float:
+    """How far open cells go from a place in a direction, about. step: less than the clearance, so that neither what is
+    closed around an obstacle nor the border is stepped over."""
     t = 0.0
     while True:
         more = room[int(r + t * ur + 0.5), int(c + t * uc + 0.5)]
         if more == 0:
             return t
-        t += max(more - 1.0, 1.0)
+        t += max(more - 1.0, step)
 
 
 @njit(cache=True, nogil=True)
@@ -177,8 +178,8 @@ def sector_of(dr: float, dc: float) -> Any:
 
 @njit(cache=True, nogil=True)
 def direction_of(sector: int) -> Any:
-    """The middle of a sector, (r, c) of length 1."""
-    along = 4.0 * (sector + 0.5) / SECTORS
+    """Where a sector begins, (r, c) of length 1."""
+    along = 4.0 * sector / SECTORS
     c = 1.0 - along if along < 2.0 else along - 3.0
     r = 1.0 - abs(c) if along < 2.0 else abs(c) - 1.0
     length = math.sqrt(r * r + c * c)
@@ -198,8 +199,10 @@ def beyond(span: Any, r: float, c: float, tile_r: int, tile_c: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def look_around(room: Any, r: float, c: float, outward_r: float, outward_c: float, span: Any, box: Any) -> None:
-    """span: (SECTORS,) out, how far to look for places in each sector, from rays in it and the two beside it.
+def look_around(
+    room: Any, r: float, c: float, outward_r: float, outward_c: float, step: float, span: Any, box: Any
+) -> None:
+    """span: (SECTORS,) out, how far to look for places in each sector, from rays along both its sides.
     box: (4,) out, first and last row and column of what is looked at. Straight outward of a corner nobody looks."""
     reach = np.empty(SECTORS)
     box[0] = box[1] = r
@@ -208,34 +211,34 @@ def look_around(room: Any, r: float, c: float, outward_r: float, outward_c: floa
         ur, uc = direction_of(k)
         reach[k] = 0.0
         if ur * outward_r + uc * outward_c <= _ROUND + 0.1:
-            reach[k] = _SLACK * ray(room, r, c, ur, uc) + _SLACK_CELLS
+            reach[k] = _SLACK * ray(room, r, c, ur, uc, step) + _SLACK_CELLS
         box[0], box[1] = min(box[0], r + reach[k] * ur), max(box[1], r + reach[k] * ur)
         box[2], box[3] = min(box[2], c + reach[k] * uc), max(box[3], c + reach[k] * uc)
     for k in range(SECTORS):
-        span[k] = max(reach[k], max(reach[k - 1], reach[(k + 1) % SECTORS]))
+        span[k] = max(reach[k], reach[(k + 1) % SECTORS])
 
 
 @njit(cache=True, nogil=True)
-def link_places(room: Any, place: Any, outward: Any, first: Any, across: int, pair: Any) -> Any:
+def link_places(room: Any, place: Any, outward: Any, first: Any, across: int, step: float, pair: Any) -> Any:
     """Pairs of places that see each other and that a way might join, the nearest of each sector: how many.
 
-    across: tiles side by side.  pair: (M, 2) int32 out; what does not fit is counted only.
+    across: tiles side by side.  step: of rays.  pair: (M, 2) int32 out; what does not fit is counted only.
     """
     m, down = 0, (first.size - 1) // across
-    linked = np.zeros((place.shape[0], SECTORS), dtype=np.bool_)
+    linked = np.zeros((place.shape[0], SECTORS // 2), dtype=np.bool_)  # by pairs of sectors
     fails = np.empty(SECTORS, dtype=np.int32)
     span, box = np.empty(SECTORS), np.empty(4)
     for i in range(place.shape[0]):
         r, c, ni, mi = float(place[i, 0]), float(place[i, 1]), outward[i, 0], outward[i, 1]
-        look_around(room, r, c, ni, mi, span, box)
+        look_around(room, r, c, ni, mi, step, span, box)
         fails[:] = 0
         top, bottom = max(int(box[0]) // TILE, 0), min(int(box[1]) // TILE, down - 1)
         left, right = max(int(box[2]) // TILE, 0), min(int(box[3]) // TILE, across - 1)
         tr, tc = place[i, 0] // TILE, place[i, 1] // TILE
         for ring in range(max(max(tr - top, bottom - tr), max(tc - left, right - tc)) + 1):
             for a in range(max(tr - ring, top), min(tr + ring, bottom) + 1):
-                step = 1 if abs(a - tr) == ring else 2 * ring
-                for b in range(tc - ring, tc + ring + 1, step):
+                skip = 1 if abs(a - tr) == ring else 2 * ring
+                for b in range(tc - ring, tc + ring + 1, skip):
                     if b < left or b > right or beyond(span, r, c, a, b):
                         continue
                     for j in range(max(first[a * across + b], i + 1), first[a * across + b + 1]):
@@ -249,7 +252,7 @@ def link_places(room: Any, place: Any, outward: Any, first: Any, across: int, pa
                         back = (k + SECTORS // 2) % SECTORS
                         if length > span[k] or fails[k] >= _FAILS:
                             continue
-                        if linked[i, k] and linked[j, back]:
+                        if linked[i, k // 2] and linked[j, back // 2]:
                             continue
                         if not sees_by_room(room, r, c, float(place[j, 0]), float(place[j, 1])):
                             fails[k] += 1
@@ -257,13 +260,13 @@ def link_places(room: Any, place: Any, outward: Any, first: Any, across: int, pa
                         if m < pair.shape[0]:
                             pair[m, 0], pair[m, 1] = i, j
                         m += 1
-                        linked[i, k] = linked[j, back] = True
+                        linked[i, k // 2] = linked[j, back // 2] = True
     return m
 
 
 @njit(cache=True, nogil=True)
 def places_in_sight(
-    room: Any, place: Any, outward: Any, first: Any, across: int, r: float, c: float, which: Any, far: Any
+    room: Any, place: Any, outward: Any, first: Any, across: int, step: float, r: float, c: float, which: Any, far: Any
 ) -> Any:
     """Places that are seen from a point and that a way from there may go round: how many.
 
@@ -271,7 +274,7 @@ def places_in_sight(
     """
     n, down = 0, (first.size - 1) // across
     span, box = np.empty(SECTORS), np.empty(4)
-    look_around(room, r, c, 0.0, 0.0, span, box)
+    look_around(room, r, c, 0.0, 0.0, step, span, box)
     left, right = max(int(box[2]) // TILE, 0), min(int(box[3]) // TILE, across - 1)
     for a in range(max(int(box[0]) // TILE, 0), min(int(box[1]) // TILE, down - 1) + 1):
         for b in range(left, right + 1):
@@ -292,8 +295,8 @@ def places_in_sight(
 
 @njit(cache=True, nogil=True)
 def way_round(
-    room: Any, place: Any, outward: Any, tile: Any, across: int, first: Any, other: Any, cost: Any, mark: Any,
-    begin: Any, end: Any, best: Any, via: Any, state: Any, stamp: int, to_go: Any,
+    room: Any, place: Any, outward: Any, tile: Any, across: int, step: float, first: Any, other: Any,
+    cost: Any, mark: Any, begin: Any, end: Any, best: Any, via: Any, state: Any, stamp: int, to_go: Any,
     heap: Any, key: Any, to_end: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
 ) -> Any:  # fmt: skip
     """The shortest way from place to place between two points, pulled taut; how many points it has, 0 if there is none.
@@ -309,13 +312,13 @@ def way_round(
     met, done = stamp, stamp + 1
     size = np.zeros(1, dtype=np.int64)
     from_mark = np.full(mark.shape[1], np.float32(_FAR_AWAY))
-    ends = places_in_sight(room, place, outward, tile, across, end[0], end[1], which, far)
+    ends = places_in_sight(room, place, outward, tile, across, step, end[0], end[1], which, far)
     for i in range(ends):
         to_end[which[i]] = far[i]
         for k in range(mark.shape[1]):
             from_mark[k] = min(from_mark[k], mark[which[i], k] + np.float32(far[i]))
     last_seen = which[:ends].copy()
-    seeds = places_in_sight(room, place, outward, tile, across, begin[0], begin[1], which, far)
+    seeds = places_in_sight(room, place, outward, tile, across, step, begin[0], begin[1], which, far)
     if ends == 0:
         return 0
     for i in range(seeds):
