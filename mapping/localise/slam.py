@@ -613,11 +613,17 @@ class Slam:
         return self._outstanding
 
     def _hand_out(self, snapshot: Snapshot) -> None:
-        self._outstanding = Work(snapshot, self.settings.closures)
+        self._outstanding = Work(snapshot, self._closing())
         lag_s = self.settings.lag_s + self.settings.lag_s_per_key * len(self._views)
         assert self._last is not None
         self._due_ns = self._last[0] + round(lag_s * 1e9)
         self._handed_out = False
+
+    def _closing(self) -> ClosureSettings:
+        """Without odometry a match that goes astray in a turn is not known to: the way cannot say what it explains."""
+        if self._key_odom is not None:
+            return self.settings.closures
+        return replace(self.settings.closures, surprise=math.inf, doubling=math.inf)
 
     def is_due(self, stamp_ns: int) -> bool:
         """Whether the result of the work that was taken must be applied before a scan of this stamp is added."""
@@ -707,7 +713,7 @@ class Slam:
         self._do(self._snapshot((), thorough=True))
 
     def _do(self, snapshot: Snapshot) -> None:
-        self._outstanding = Work(snapshot, self.settings.closures)
+        self._outstanding = Work(snapshot, self._closing())
         self.apply(self._outstanding.run())
 
     def add_closure(self, start: int, to: int, measured: Pose2, information: F64) -> int:

@@ -44,3 +44,13 @@ def test_a_step_on_which_nothing_was_matched_promises_little() -> None:
     unmatched = sigma[sigma[:, 0] > 0.1]
     assert len(unmatched) > 0
     assert unmatched[:, 2].min() > math.radians(5.0)
+
+
+def test_what_the_way_explains_is_asked_of_odometry_only() -> None:
+    """In fr079 without its odometry true closures were refused: turns that went astray were not known to."""
+    for has_odometry in (True, False):
+        slam = Slam()
+        for k in range(12):
+            at = Pose2(-2.0 + 0.12 * k, 0.0, 0.0)
+            slam.add_scan(room(at, k), Pose2(), at if has_odometry else None)
+        assert math.isinf(slam._closing().surprise) is not has_odometry
