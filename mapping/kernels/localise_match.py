@@ -20,7 +20,6 @@ FARTHEST_ASIDE_RAD = 1.4
 FACING = 0.6  # cosine: surfaces that meet under a larger angle are not the same one
 GRAZING_SHARE = 0.75  # of the spacing of beams on a wall: how far from one of its points the wall is taken to go on
 
-SAME_PARTNERS = 0.01  # metres, and a third of radians: after a step that is smaller partners are not looked for again
 CONVERGED = 4e-4
 
 LEVELS = 4
@@ -213,13 +212,14 @@ def solve3(h: Any, g: Any, out: Any) -> bool:
 def align(
     sx: Any, sy: Any, snx: Any, sny: Any, squality: Any,
     x: Any, y: Any, nx: Any, ny: Any, quality: Any, frames: Any, rows: Any, poses: Any,
-    guess: Any, prior: Any, reach_m: Any, scale_m: Any, most_steps: int, result: Any,
+    guess: Any, prior: Any, reach_m: Any, scale_m: Any, most_steps: int, same_partners: float, result: Any,
 ) -> None:  # fmt: skip
     """Pose of a source view that lays it on several reference views at once (point to line, Gauss-Newton).
 
     rows: (R,) which views of the store are references; poses: (R, 3) theirs.  guess: (3,).  prior: (3, 3) weight of
     staying at the guess, in points.  reach_m, scale_m: (LEVELS,) from coarse to fine; the coarse levels see every
-    other point and reference, and are left as soon as steps are small.
+    other point and reference, and are left as soon as steps are small.  same_partners: after a smaller step, metres and
+    a third of radians, partners are not looked for again.
     result: (RESULT_LENGTH,) pose, upper triangle of H in points, robust cost, correspondences, steps (-1: failed).
     """
     pose = guess.copy()
@@ -266,7 +266,7 @@ def align(
             level = LEVELS - 1 if moved < 0.04 else level + 1
         elif moved < CONVERGED:
             break
-        known = last and moved < SAME_PARTNERS
+        known = last and moved < same_partners
     for a in range(3):
         result[RESULT_POSE + a] = pose[a]
     for a in range(6):
