@@ -35,7 +35,7 @@ class Depths:
 
 
 def depths_of(scan: Scan, table: BearingTable) -> Depths:
-    """Of a de-skewed sweep."""
+    """Of a de-skewed sweep, in its sensor's frame [m]; beams without a finite range count for nothing."""
     nearest, farthest = np.empty(table.bins), np.empty(table.bins)
     fill_depths(_row(scan.bearing_rad), _row(scan.range_m), table.frame(), nearest, farthest)
     return Depths(table, nearest, farthest)
@@ -44,13 +44,12 @@ def depths_of(scan: Scan, table: BearingTable) -> Depths:
 def is_changed(scan: Scan, depths: Depths, seen_from_base: F64, base_from_sensor: Pose2) -> bool:
     """Whether the surfaces of a sweep (N beams) lie elsewhere than those seen before.
 
-    seen_from_base: (N, 3) or, for all beams, (3,): pose of the base at each beam, from where the sensor was as it saw
-    `depths`. A beam counts if there was a surface about its bearing; it is changed if it ends clearly before or behind
-    that, or meets nothing. False where fewer than LEAST_JUDGED beams count.
+    seen_from_base: (N, 3) x, y [m], yaw [rad] of the base at each beam, in the frame in which the sensor saw `depths`.
+    base_from_sensor: its mount. A beam counts if there was a surface about its bearing; it is changed if it ends
+    clearly before or behind that, or meets nothing. False where fewer than LEAST_JUDGED beams count.
     """
-    base = np.broadcast_to(seen_from_base, (len(scan.bearing_rad), 3))
     sensor = motion.carried(
-        np.ascontiguousarray(base), base_from_sensor.x_m, base_from_sensor.y_m, base_from_sensor.yaw_rad
+        np.ascontiguousarray(seen_from_base), base_from_sensor.x_m, base_from_sensor.y_m, base_from_sensor.yaw_rad
     )
     judged, changed = count_changed(
         _row(scan.bearing_rad), _row(scan.range_m), sensor, max(scan.range_min_m, 0.0),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from service.errors import Trouble
 from service.outputs import GridOut, GridUpdateOut, HealthOut, OdomOut, Output, PoseOut, RangesOut, ScanOut
 from service.payloads import Message
 from service.publisher import Outbox, Parcel, Publisher, slot_of
-from service.rpc import CallRefused, Calls, map_name
+from service.rpc import _NEEDS, CallRefused, Calls, map_name
 from service.zenoh_session import NetworkSettings, is_loopback, refuse_open_listeners
 
 
@@ -194,6 +195,17 @@ def started(calls: Calls) -> Any:
     session = FakeSession()
     calls.start(session)
     return session.ask
+
+
+def test_a_call_that_is_not_there_says_what_it_needs() -> None:
+    calls = Calls("robots/r")
+    calls.register("record_stop", lambda _: {})
+    with pytest.raises(CallRefused, match=r"save_map needs a map: \[grid\].*there are: record_stop"):
+        calls._call("save_map", b"")
+    with pytest.raises(CallRefused, match="no call 'dance'"):
+        calls._call("dance", b"")
+    documented = (Path(__file__).parents[3] / "docs/keys.md").read_text()
+    assert all(f"{name}`" in documented for name in _NEEDS)
 
 
 @pytest.mark.parametrize(

@@ -217,19 +217,11 @@ def test_what_fits_nothing_is_not_drawn_until_something_fits_again() -> None:
     clutter = np.random.default_rng(5).uniform(0.4, 0.6, len(BEARING))  # a cloth over the lens
     round_ = Round(robot.stamp_ns, (Cone(0, Pose2(), 1.0),), 0.5, 0.1, 3.0)
     for _ in range(30):
+        robot.stamp_ns += 1000 * MS  # so long that a robot which stands looks anew
         assert not robot.look(here, here, clutter)
         assert not robot.localiser.take_round("sonars", round_, here)
     counts = robot.localiser.counters()
     assert counts["slam.scans_not_drawn"] == counts["slam.rounds_not_drawn"] == 30
-    assert any("nothing is drawn" in trouble for trouble in robot.localiser.troubles()) or counts["slam.scans"] < 25
+    assert any("nothing is drawn" in trouble for trouble in robot.localiser.troubles())
     assert robot.look(here, here)
     assert robot.localiser.take_round("sonars", round_, here)
-
-
-def test_a_call_that_is_not_there_says_what_it_needs() -> None:
-    calls = Calls("robots/r")
-    calls.register("record_stop", lambda _: {})
-    with pytest.raises(CallRefused, match=r"save_map needs a map: \[grid\].*there are: record_stop"):
-        calls._call("save_map", b"")
-    with pytest.raises(CallRefused, match="no call 'dance'"):
-        calls._call("dance", b"")
