@@ -607,6 +607,8 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
         seen_by = [each for each in found.values() if isinstance(each, Laser) and each.name in fed_by]
         mounts = {each.name: each.base_from_sensor for each in seen_by}
         makers.append(SceneMaker(mounts, most=config.scenes.most, period_ns=round(config.scenes.period_s * 1e9)))
+    if config.calibration.enabled and config.drive.source is not None:
+        makers.extend(_calibration_maker(config, found))
     if _has_rooms(config, found):
         from service.room_maker import RoomMaker
 
@@ -648,6 +650,19 @@ def _agreement_maker(config: Config, makers: Sequence[MapMaker], lasers: frozens
         sources=lasers,
         period_ns=round(config.agreement.period_s * 1e9),
     )
+
+
+def _calibration_maker(config: Config, found: Mapping[str, Sensor]) -> Iterator[MapMaker]:
+    """None without a laser that looks level."""
+    wanted = _sources(config, config.calibration.sources, found)
+    lasers = {name: each for name, each in found.items() if isinstance(each, Laser) and not each.tilts}
+    mounts = {name: each.base_from_sensor for name, each in lasers.items() if name in wanted}
+    if mounts:
+        from service.calibration_maker import CalibrationMaker
+
+        sections = {config.source_name(section, name): f"{section}.{name}" for section, name, _ in config.devices()}
+        period_ns = round(config.calibration.period_s * 1e9)
+        yield CalibrationMaker(geometry_of(config.drive), mounts, sections, period_ns=period_ns)
 
 
 def _place_maker(config: Config, found: Mapping[str, Sensor]) -> Iterator[MapMaker]:

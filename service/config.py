@@ -37,6 +37,7 @@ from service.config_maps import (
     AgreementSettings,
     Alignment,
     Artos,
+    CalibrationSettings,
     ClearanceSettings,
     ElevationSettings,
     Grid,
@@ -82,6 +83,9 @@ class Config(Section):
     places: PlaceMapSettings = Field(default=PlaceMapSettings(), description="Places and hallways.")
     scenes: SceneMapSettings = Field(default=SceneMapSettings(), description="Scenes to be recognised again.")
     rooms: RoomMapSettings = Field(default=RoomMapSettings(), description="Rooms, doors, plans.")
+    calibration: CalibrationSettings = Field(
+        default=CalibrationSettings(), description="What wheels and mounts of lasers really are."
+    )
     agreement: AgreementSettings = Field(default=AgreementSettings(), description="Maps held against each other.")
     slam: SlamLive = Field(default=SlamLive(), description="Where the robot is, by laser scans.")
     localise: LocaliseIn = Field(default=LocaliseIn(), description="Finding the robot in a given map.")
@@ -290,6 +294,8 @@ def _reference_faults(data: Mapping[str, Any]) -> Iterator[Fault]:
         (("grid",), _table(data, "grid")),
         (("local_grid",), _table(data, "local_grid")),
         (("lines",), _table(data, "lines")),
+        (("scenes",), _table(data, "scenes")),
+        (("calibration",), _table(data, "calibration")),
         (("slam",), _table(data, "slam")),
         (("localise",), _table(data, "localise")),
     ):

@@ -200,6 +200,14 @@ class RoomMapSettings(Section):
     clearance_m: float = Field(default=0.3, ge=0.0, le=10.0, description="What plans keep off, if they are not told.")
 
 
+class CalibrationSettings(Section):
+    """What wheels and mounts of lasers really are, from driving about: key calibration. Needs [drive] source."""
+
+    enabled: bool = Field(default=True, description="Look for it.")
+    sources: tuple[Reference, ...] | None = Field(default=None, description="Lasers that are used; default: all.")
+    period_s: float = Field(default=10.0, ge=1.0, le=3600, description="Shortest time between two reports.")
+
+
 class AgreementSettings(Section):
     """Grid, lines, rooms and regions held against each other: key map/agreement. Needs [grid]."""
 

@@ -27,7 +27,7 @@ from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service.errors import Trouble
 from service.fusion import Round, Touch
-from service.outputs import CloudOut, GridOut, GridUpdateOut, LookOut, Output, PoseOut
+from service.outputs import CloudOut, GridOut, GridUpdateOut, LookOut, OdomOut, Output, PoseOut
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +37,7 @@ T = TypeVar("T")
 SWEEPS_WAITING_MAX = 128
 _CLOUDS_WAITING_MAX = 4
 _GRIDS_WAITING_MAX = 256
+_ODOMETRY_WAITING_MAX = 4096
 _TURN_S = 0.1
 _ASK_LIMIT_S = 10.0
 Tile = tuple[int, int, bytes]
@@ -128,6 +129,14 @@ class MadeOfLooks(Protocol):
 
 
 @runtime_checkable
+class MadeOfOdometry(Protocol):
+    """A maker that wants where the wheels have the robot, every time."""
+
+    def take_odometry(self, odom: OdomOut) -> None:
+        """One pose in the odom frame; those before a sweep's last beam come before the sweep."""
+
+
+@runtime_checkable
 class Counting(Protocol):
     """A maker whose counters belong into the health of the daemon."""
 
@@ -160,6 +169,8 @@ class MapMakers:
         self._grids: deque[GridOut | GridUpdateOut] = deque()
         self._clouds: deque[CloudOut] = deque()
         self._looks: deque[LookOut] = deque()
+        self._odometry: deque[OdomOut] = deque()
+        self._wants_odometry = any(isinstance(maker, MadeOfOdometry) for maker in makers)
         self._asked: deque[tuple[Callable[[], object], threading.Event, list[object]]] = deque()
         self._changed = threading.Condition()
         self._stopping = False
@@ -172,6 +183,7 @@ class MapMakers:
             "makers.grids_lost": 0,
             "makers.clouds_lost": 0,
             "makers.looks_lost": 0,
+            "makers.odometry_lost": 0,
             "makers.errors": 0,
         }
 
@@ -230,6 +242,12 @@ class MapMakers:
                         self.counts["makers.clouds_lost"] += 1
             case PoseOut():
                 self._pose = output
+            case OdomOut() if self._wants_odometry:
+                with self._changed:
+                    self._odometry.append(output)
+                    if len(self._odometry) > _ODOMETRY_WAITING_MAX:
+                        self._odometry.popleft()
+                        self.counts["makers.odometry_lost"] += 1
             case GridOut(name="grid"):
                 with self._changed:
                     self._grids.clear()  # it says all that they would
@@ -301,6 +319,7 @@ class MapMakers:
             grids, self._grids = self._grids, deque()
             clouds, self._clouds = self._clouds, deque()
             looks, self._looks = self._looks, deque()
+            odometry, self._odometry = self._odometry, deque()
             asked, self._asked = self._asked, deque()
             redrawn, self._redrawn = self._redrawn, None
         for work, done, result in asked:
@@ -318,6 +337,9 @@ class MapMakers:
         for output in grids:
             self._note(self._mirror.take(output))
         for desk in self._desks:
+            if isinstance(desk.maker, MadeOfOdometry):
+                for odom in odometry:
+                    self._guard(desk, partial(desk.maker.take_odometry, odom))
             for source, scan, map_from_sensor in sweeps:
                 if source in desk.maker.sources:
                     desk.is_fed = True

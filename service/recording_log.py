@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs import Log, LogError, LogScan, Odometry, PoseKind, Provenance, read_log
+from drivers.logs import Log, LogError, LogScan, Odometry, PoseKind, Provenance, WheelGeometry, read_log
 from mapping.frames import IDENTITY, Pose2
 from mapping.scan import Scan, seen_from
 from service import assemble
@@ -73,6 +73,7 @@ def log_of_recording(path: Path) -> Log:
             path=str(path), dialect="umfeld recording", file_bytes=sum(file.stat().st_size for file in recording.files),
             sha256=hashlib.sha256(files).hexdigest(),
         ),
+        wheels=_wheels_of(config),
     )  # fmt: skip
 
 
@@ -128,6 +129,14 @@ def _log_scan(scan: Scan, poses: F64, robot_from_laser: Pose2, offset_ns: int, n
         robot_pose=(robot.x_m, robot.y_m, robot.yaw_rad),
         line=number,
     )
+
+
+def _wheels_of(config: Config) -> WheelGeometry | None:
+    """What made the odometry, if wheels did."""
+    if config.drive.source is None:
+        return None
+    drive = assemble.geometry_of(config.drive)
+    return WheelGeometry(drive.left_m_per_tick, drive.right_m_per_tick, drive.track_width_m)
 
 
 def _plain(recording: Recording) -> Config:

@@ -16,6 +16,7 @@ JSON_HEALTH = "application/json;umfeld.health.v1"
 JSON_INFO = "application/json;umfeld.info.v1"
 JSON_GRID = "application/json;umfeld.grid.v1"
 JSON_LINES = "application/json;umfeld.lines.v1"
+JSON_CALIBRATION = "application/json;umfeld.calibration.v1"
 JSON_SCENES = "application/json;umfeld.scenes.v1"
 JSON_GRAPH = "application/json;umfeld.graph.v1"
 JSON_PLANES = "application/json;umfeld.planes.v1"
@@ -256,6 +257,16 @@ MAP_SCENES = Topic(
     cached=True,
     lane=Lane.MAP,
 )
+CALIBRATION = Topic(
+    "calibration",
+    "umfeld.calibration.v1",
+    JSON_CALIBRATION,
+    "at most every 10 s, on change",
+    "What the wheels and the mounts of lasers really are, by the drive so far, beside what is configured.",
+    Priority.BACKGROUND,
+    cached=True,
+    lane=Lane.MAP,
+)
 MAP_GRAPH = Topic(
     "map/graph",
     "umfeld.graph.v1",
@@ -392,6 +403,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_CLEARANCE,
     MAP_LINES,
     MAP_SCENES,
+    CALIBRATION,
     MAP_GRAPH,
     LOCALISATION,
     MAP_PLANES,

@@ -111,11 +111,15 @@ def _steps(config: Config) -> dict[str, Step]:
         from mapping.localise.warm_up import warm_up_in_map
 
         steps["localise"] = warm_up_in_map
-    elif config.slam.enabled and any(isinstance(sensor, Laser) for sensor in found.values()):
-        from mapping.grids.warm_up import warm_up as warm_up_grids
+    has_slam = config.localise.mode != "map" and config.slam.enabled
+    has_slam = has_slam and any(isinstance(sensor, Laser) for sensor in found.values())
+    if has_slam or "calibration" in names:
         from mapping.localise.warm_up import warm_up as warm_up_slam
 
         steps["slam"] = warm_up_slam
+    if has_slam:
+        from mapping.grids.warm_up import warm_up as warm_up_grids
+
         steps["grids"] = warm_up_grids
     steps["fusion"] = lambda: _fusion(config, found)
     return steps

@@ -113,7 +113,8 @@ class Log:
     scans: in the order in which they were taken.  robot_from_laser: where the laser sits on the robot.
     no_echo_from_m: readings at or above it were taken as "no echo" (+inf if the log has none).
     stamps_repaired: how many scans' stamps were replaced (`in_order`).  stamps_made_up: all were (`made_up_stamps`).
-    skipped: lines that were not used, by reason.  ticks, wheels: raw counts and their meaning, where the log has them.
+    skipped: lines that were not used, by reason.  ticks: raw counts, where the log has them.  wheels: their meaning, or
+    what made the odometry.
     """
 
     scans: tuple[LogScan, ...]

@@ -139,6 +139,28 @@ def calibrate(ticks: WheelTicks, motions: RelativeMotions, start: RobotModel) ->
     return problem.solved(min(starts, key=problem.spread))
 
 
+def rolled_back(stamp_s: F64, pose: F64, model: RobotModel) -> WheelTicks:
+    """Wheels that would have made these poses of the base (M, 3): each step's arc and turn, forwards where it points
+    forwards.
+
+    Exact for poses that such wheels made. Rows whose stamp does not rise are left out.
+    """
+    turn = wrap_angles(np.diff(pose[:, 2]))
+    dx, dy = np.diff(pose[:, 0]), np.diff(pose[:, 1])
+    heading = pose[:-1, 2] + 0.5 * turn
+    arc = (dx * np.cos(heading) + dy * np.sin(heading)) / np.sinc(turn / (2.0 * np.pi))
+    half = 0.5 * turn * model.track_width_m
+    left = np.concatenate(([0.0], np.cumsum(arc - half))) / model.left_m_per_tick
+    right = np.concatenate(([0.0], np.cumsum(arc + half))) / model.right_m_per_tick
+    return rising(stamp_s, left, right)
+
+
+def rising(stamp_s: F64, left: F64, right: F64) -> WheelTicks:
+    """Without the rows whose stamp does not rise."""
+    first = np.diff(np.maximum.accumulate(stamp_s), prepend=-np.inf) > 0.0
+    return WheelTicks(stamp_s[first], left[first], right[first])
+
+
 def dead_reckoned(ticks: WheelTicks, model: F64, at_s: F64) -> F64:
     """Poses (N, 3) of the base at times (N,) of the wheels' clock, from (0, 0, 0) at the first ticks; model: (7,).
 

@@ -77,37 +77,69 @@ def spread_out(poses: F64, *, way_m: float = WAY_M, turn_rad: float = TURN_RAD) 
     return np.array(chosen, dtype=np.int64)
 
 
+@dataclass(frozen=True, slots=True)
+class LaserMotion:
+    """One of them: as a row of RelativeMotions."""
+
+    start_s: float
+    end_s: float
+    motion: F64
+    covariance: F64
+
+
+def joined_motions(found: Sequence[LaserMotion], rejected: int = 0) -> RelativeMotions:
+    """As the calibration takes them."""
+    span = np.array([(each.start_s, each.end_s) for each in found]).reshape(-1, 2)
+    motion = np.array([each.motion for each in found]).reshape(-1, 3)
+    covariance = np.array([each.covariance for each in found]).reshape(-1, 3, 3)
+    return RelativeMotions(span[:, 0], span[:, 1], motion, covariance, rejected)
+
+
+class MotionMeter:
+    """Takes one sweep after another; each is matched with the one before it.
+
+    Each pair is matched both ways and the two answers are joined, so what one way gets wrong at the edges of what
+    both saw, the other gets wrong the other way round. Sweeps are taken as swept at once (de-skewed).  rejected: how
+    many pairs did not fit.
+    """
+
+    def __init__(self) -> None:
+        self.rejected = 0
+        self._table: BearingTable | None = None
+        self._before: tuple[int, View, Pose2] | None = None
+
+    def take(self, scan: Scan, guess: Pose2) -> LaserMotion | None:
+        """The motion from the sweep before to this one; None if there is none before, or they do not fit.
+
+        guess: about where the laser is, in the frame of the guess before. ValueError if the first sweep has fewer than
+        three beams.
+        """
+        self._table = table_for(scan.bearing_rad) if self._table is None else self._table
+        before, here = self._before, (scan.stamp_ns, view_of(scan, self._table, farthest_m=FARTHEST_M), guess)
+        self._before = here
+        if before is None:
+            return None
+        found = _between(before[1], here[1], before[2].inverse() @ guess)
+        if found is None:
+            self.rejected += 1
+            return None
+        return LaserMotion(before[0] * 1e-9, scan.stamp_ns * 1e-9, _row(found[0]), found[1])
+
+    def begin_anew(self) -> None:
+        """The next sweep has none before it: the frame of the guesses changed."""
+        self._before = None
+
+
 def relative_motions(scans: Sequence[Scan], guesses: F64) -> RelativeMotions:
     """Motions between sweeps that follow each other; guesses: (N, 3) about where the laser was in any one frame.
 
-    Each pair is matched both ways and the two answers are joined, so what one way gets wrong at the edges of what
-    both saw, the other gets wrong the other way round. Choose the sweeps by `spread_out`; they are taken as swept at
-    once (de-skewed). Pairs that do not fit are left out and counted.
+    Choose the sweeps by `spread_out`. Pairs that do not fit are left out and counted.
     """
     if len(scans) != len(guesses):
         raise ValueError(f"{len(scans)} scans and {len(guesses)} guesses")
-    times: list[tuple[float, float]] = []
-    motions: list[F64] = []
-    covariances: list[F64] = []
-    rejected = 0
-    table: BearingTable | None = None
-    before: tuple[Scan, View, Pose2] | None = None
-    for scan, row in zip(scans, guesses):
-        table = table_for(scan.bearing_rad) if table is None else table
-        here = (scan, view_of(scan, table, farthest_m=FARTHEST_M), Pose2(*row.tolist()))
-        if before is not None:
-            found = _between(before[1], here[1], before[2].inverse() @ here[2])
-            if found is None:
-                rejected += 1
-            else:
-                times.append((before[0].stamp_ns * 1e-9, scan.stamp_ns * 1e-9))
-                motions.append(_row(found[0]))
-                covariances.append(found[1])
-        before = here
-    span = np.array(times).reshape(-1, 2)
-    return RelativeMotions(
-        span[:, 0], span[:, 1], np.array(motions).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3), rejected
-    )
+    meter = MotionMeter()
+    taken = [meter.take(scan, Pose2(*row.tolist())) for scan, row in zip(scans, guesses)]
+    return joined_motions([each for each in taken if each is not None], meter.rejected)
 
 
 def _between(first: View, second: View, guess: Pose2) -> tuple[Pose2, F64] | None:

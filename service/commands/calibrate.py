@@ -1,4 +1,4 @@
-"""`umfeld calibrate`: what the wheels and the laser's mount really are, from a recorded drive."""
+"""`umfeld calibrate`: what the wheels and the laser's mount really are, from a recorded drive or a running daemon."""
 
 from __future__ import annotations
 
@@ -14,7 +14,13 @@ app = typer.Typer()
 
 @app.command()
 def calibrate(
-    log: Annotated[Path, typer.Argument(help="A recorded log with wheel ticks or odometry, and a laser; or .gz.")],
+    log: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A recorded log with wheel ticks or odometry, and a laser; or .gz; or a recording (.mcap or its "
+            "folder). Without one the running daemon is asked."
+        ),
+    ] = None,
     *,
     way_m: Annotated[
         float | None,
@@ -26,6 +32,11 @@ def calibrate(
     track_width_m: Annotated[
         float | None, typer.Option("--track-width", min=0.01, help="As the odometry took it, for logs without ticks.")
     ] = None,
+    connect: Annotated[
+        str | None, typer.Option(help="The daemon's endpoint; default: that of the configuration.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="The daemon's configuration file.")] = None,
+    robot: Annotated[str | None, typer.Option(help="The robot's id, where several answer.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Wheel gains, track width, the laser's place on the robot and the time between both clocks, each with how sure.
@@ -33,8 +44,12 @@ def calibrate(
     Any drive will do that goes straight, turns both ways and changes its speed. What it does not tell is said to be
     "not observable yet". Nothing is changed: the numbers are advice. Exit code 1 if nothing at all is observable.
 
-    Example: umfeld calibrate exp1.dat.gz --ticks-per-turn 2000
+    Examples: umfeld calibrate exp1.dat.gz --ticks-per-turn 2000
+    umfeld calibrate
     """
+    if log is None:
+        _ask_daemon(connect, config, robot, as_json=as_json)
+        return
     from rich.console import Console
     from rich.progress import Progress
 
@@ -47,7 +62,7 @@ def calibrate(
             log, way_m=way_m, track_width_m=track_width_m,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
-    report = offline.report_of(run, None if ticks_per_turn is None else (ticks_per_turn, ticks_per_turn))
+    report = run.report(None if ticks_per_turn is None else (ticks_per_turn, ticks_per_turn))
     if as_json:
         typer.echo(json.dumps(report, indent=2))
     else:
@@ -56,8 +71,34 @@ def calibrate(
         raise typer.Exit(1)
 
 
+def _ask_daemon(connect: str | None, config: Path | None, robot: str | None, *, as_json: bool) -> None:
+    from service.config_files import daemon_endpoint, find_config
+    from service.errors import Trouble
+    from service.zenoh_session import Client
+
+    with Client(connect or daemon_endpoint(find_config(config))) as client:
+        base = client.only_base(None if robot is None else f"robots/{robot}")
+        payloads = [each.payload for each in client.get(f"{base}/calibration")]
+    if not payloads:
+        raise Trouble(
+            f"{base} has no calibration yet: it needs [calibration] enabled, [drive] source, a laser and a few metres "
+            "of driving"
+        )
+    document = json.loads(payloads[0])
+    if as_json:
+        typer.echo(json.dumps(document, indent=2))
+        return
+    for laser, report in document["lasers"].items():
+        typer.secho(f"by {laser}", bold=True)
+        _print(report)
+        for each in report["advice"]:
+            typer.echo(
+                f"{'look at':<22} {each['setting']} = {each['value']} ± {each['deviation']}, not {each['instead_of']}"
+            )
+
+
 def _print(report: dict[str, Any]) -> None:
-    from service.calibrate_log import NOT_OBSERVABLE
+    from service.calibration_report import NOT_OBSERVABLE
 
     for name, row in report["values"].items():
         factor = 180.0 / math.pi if name.endswith("_rad") else 1.0

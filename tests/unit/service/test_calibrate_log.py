@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from mapping.localise.calibrate import NAMES, Calibration, RobotModel
 from mapping.localise.relative_motions import RelativeMotions
-from service.calibrate_log import LogCalibration, report_of
+from service.calibrate_log import LogCalibration
 from service.commands.calibrate import app
 from service.errors import WrongUsage
 
@@ -31,7 +31,7 @@ def found(observable: list[bool]) -> LogCalibration:
 
 
 def test_what_is_not_observable_is_null_and_named() -> None:
-    report = report_of(found([True, True, False, True, True, False, True]), (2000.0, 2000.0))
+    report = found([True, True, False, True, True, False, True]).report((2000.0, 2000.0))
     values = report["values"]
     assert isinstance(values, dict)
     assert report["not_observable"] == ["track_width_m", "laser_yaw_rad"]
@@ -42,7 +42,7 @@ def test_what_is_not_observable_is_null_and_named() -> None:
 
 
 def test_a_square_of_what_was_believed_ends_off() -> None:
-    square = report_of(found([True] * 7))["umbmark"]
+    square = found([True] * 7).report()["umbmark"]
     assert isinstance(square, dict)
     assert 0.1 < square["worst_m"] < 2.0
 
