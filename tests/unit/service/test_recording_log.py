@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from drivers.logs import LogError
 from mapping.frames import Pose2
 from mapping.scan import Scan
-from service.recording_log import _log_scan, read_any_log
+from service.config import Config
+from service.recording_log import _log_scan, _wheels_of, read_any_log
 
 SPEEDS = st.floats(-2.0, 2.0)
 
@@ -52,3 +53,17 @@ def test_a_file_that_only_begins_like_a_recording_is_told(tmp_path: Path) -> Non
         read_any_log(tmp_path / "absent.mcap")
     with pytest.raises(LogError, match="no recording"):
         read_any_log(tmp_path)
+
+
+def test_a_recording_tells_what_made_its_odometry() -> None:
+    data = {
+        "drive": {"source": "base", "ticks_per_turn_right": -4096.0, "track_width_m": 0.4},
+        "wheels": {"base": {"driver": "cia406", "can": "main"}},
+        "can": {"main": {"interface": "virtual", "channel": "x"}},
+    }
+    wheels = _wheels_of(Config.model_validate(data))
+    assert wheels is not None
+    assert wheels.left_m_per_tick == pytest.approx(2.0 * math.pi * 0.1 / 4096.0)
+    assert wheels.right_m_per_tick == -wheels.left_m_per_tick
+    assert wheels.track_width_m == 0.4
+    assert _wheels_of(Config()) is None
