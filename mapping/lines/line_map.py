@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -91,6 +91,35 @@ class LineMap:
             self._remove(index)
         self.version += bool(doomed)
         return len(doomed)
+
+    def around(self, x_m: float, y_m: float, reach_m: float) -> I64:
+        """Numbers of the lines in the index cells within reach of a place, oldest first; good until the next change."""
+        found: set[int] = set()
+        for column in _span(x_m - reach_m, x_m + reach_m):
+            for at in _span(y_m - reach_m, y_m + reach_m):
+                found |= self._in_cell.get((column, at), set())
+        return np.array(sorted(found, key=self._born.__getitem__), dtype=np.int64)
+
+    def ends(self, numbers: I64) -> F64:
+        """Starts and ends (L, 4) of lines by their numbers."""
+        return np.ascontiguousarray(self._table[numbers, : kernels.WEIGHT])
+
+    def keep_pieces(self, number: int, pieces: Sequence[tuple[float, float]]) -> None:
+        """Keep of a line only the pieces from one way to another, metres from its start. Each takes its share of the
+        points, taken as spread evenly; none: the line is forgotten."""
+        row, born = self._table[number : number + 1].copy(), self._born[number]
+        line = Lines(row, np.full((1, 2), -1, dtype=np.int64))
+        length = float(line.length_m[0])
+        self._remove(number)
+        for begin, end in pieces:
+            ways = np.array([[begin], [end]]) / max(length, 1e-9)
+            start_m, end_m = line.start_m + ways * (line.end_m - line.start_m)
+            share = (end - begin) / max(length, 1e-9)
+            count = np.maximum(np.rint(share * line.count), 2.0)
+            rms = np.maximum(line.rms_m, 0.5 / _RMS_STEPS)
+            made = rows_of_ends(start_m[None], end_m[None], count, line.seen.astype(np.float64), rms)
+            self._add(made[0], born)
+        self.version += 1
 
     # ---------------------------------------------------------------------------------------------------- the index
 

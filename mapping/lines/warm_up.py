@@ -6,6 +6,7 @@ import numpy as np
 
 from mapping.frames import Pose2
 from mapping.lines.extract import LineExtractor, extract_from_points
+from mapping.lines.gone import LOOKS, Doubts
 from mapping.lines.line_map import LineMap
 
 
@@ -18,3 +19,6 @@ def warm_up() -> None:
     line_map.insert(LineExtractor(bearing).extract(ranges), Pose2())
     line_map.insert(extract_from_points(points, spacing_rad=0.035, full_turn=True), Pose2(0.01, 0.0, 0.0))
     line_map.raycast((0.0, 0.0), bearing)
+    doubts = Doubts()
+    for _ in range(LOOKS):
+        doubts.look(line_map, bearing, 2.0 * ranges, Pose2())

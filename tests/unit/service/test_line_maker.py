@@ -168,3 +168,24 @@ def test_document() -> None:
         assert aa > 0.0
         assert aa * dd > ad * ad
         assert entry["scans"] == 2
+
+
+def test_a_wall_that_was_taken_away_is_told_no_more() -> None:
+    """By a robot that stands only what it looks at straight, as that might be glass; what was cut is counted."""
+    maps = maker()
+    for step in range(5):
+        maps.take_sweep("front", sweep(still(0.2 * step)), still(0.2 * step))
+    (before,) = told(maps)
+    assert maps.counts == {"lines.cut": 0}
+    farther = sweep(still(-2.0))  # the wall ahead now stands 2 m farther away
+    for k in range(10):
+        scan = Scan(k * SECOND // 10, 0.0, BEARING, farther.range_m, 0.1, 20.0)
+        maps.take_sweep("front", scan, np.array([0.0, 0.0, 0.0]))
+    (after,) = told(maps)
+    assert maps.counts["lines.cut"] > 0
+
+    def ahead(document: dict[str, Any]) -> float:
+        lines = [line for line in document["lines"] if abs(line["start"][0] - WALL_X_M) < 0.1]
+        return sum(abs(float(line["end"][1]) - float(line["start"][1])) for line in lines)
+
+    assert ahead(after) == pytest.approx(ahead(before) - 0.5, abs=0.11)
