@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivers.reader import WireReader
 from mapping.frames import IDENTITY, Pose2
-from service import assemble, health, recording
+from service import assemble, assemble_makers, health, recording
 from service.background import Background
 from service.clock import Clock, SystemClock
 from service.config import Config, Loaded
@@ -167,9 +167,9 @@ class Daemon:
             )
         finally:
             starting()  # what hindered it is told before a minute of compiling has passed
-        makers = assemble.map_makers(config, self._sensors)
+        makers = assemble_makers.map_makers(config, self._sensors)
         self._makers = MapMakers(makers, self._publisher.offer, now_ns=self._clock.now_ns)
-        self._ground = assemble.sector_ground(config, makers)
+        self._ground = assemble_makers.sector_ground(config, makers)
         if store is not None:
             self._makers.restore(store.load_tiles)
         background = Background()

@@ -34,7 +34,7 @@ from drivers.readings import (
     ScanReading,
     WheelReading,
 )
-from service import assemble
+from service import assemble, assemble_makers
 from service.config import Config, from_document
 from service.fusion import Fusion, OdometryOnly
 from service.sensors import AxleEncoder, Chain, Contacts, Laser, PoseSource, Ring, Sensor, Wheels
@@ -81,7 +81,7 @@ def _warm(config: Config, steps: dict[str, Step], stop_asked: Callable[[], bool]
 def _steps(config: Config) -> dict[str, Step]:
     """What there is to warm up, by name; the small ones first: the first tells whether the cache is cold."""
     found = assemble.sensors(config)
-    names = {maker.name for maker in assemble.map_makers(config, found)}
+    names = {maker.name for maker in assemble_makers.map_makers(config, found)}
     steps: dict[str, Step] = {"footprint": lambda: _footprint(config), "clearance": _clearance}
     if "lines" in names:
         from mapping.lines.warm_up import warm_up as warm_up_lines

@@ -11,7 +11,7 @@ import jsonschema
 import pytest
 
 from mapping.odometry import DriveGeometry
-from service import assemble
+from service import assemble, assemble_makers
 from service.calibration_maker import KEY, CalibrationMaker
 from service.config import Config
 from service.map_makers import MapMakers
@@ -41,7 +41,7 @@ def documents() -> list[dict[str, Any]]:
             told.append(json.loads(Encoder().encode(output, 0)[0].payload))
 
     sensors = assemble.sensors(config)
-    (maker,) = (each for each in assemble.map_makers(config, sensors) if isinstance(each, CalibrationMaker))
+    (maker,) = (each for each in assemble_makers.map_makers(config, sensors) if isinstance(each, CalibrationMaker))
     driving = drive("flat", 6.3)
     made = robot(driving.truth(0), config=config, makers=MapMakers([maker], offer, now_ns=lambda: 0))
     made.play(driving.items)

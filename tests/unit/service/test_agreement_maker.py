@@ -10,7 +10,7 @@ import jsonschema
 import numpy as np
 
 from mapping.grids.patch import GridPatch
-from service import assemble
+from service import assemble, assemble_makers
 from service.agreement_maker import KINDS, AgreementMaker
 from service.commands.status import agreement_text
 from service.config import Config
@@ -91,11 +91,11 @@ def test_large_maps_are_compared_less_often() -> None:
 
 def test_it_is_built_after_the_maps_it_compares() -> None:
     config = Config.model_validate({"lasers": {"front": {"driver": "hokuyo", "port": "/dev/none"}}})
-    names = [maker.name for maker in assemble.map_makers(config, assemble.sensors(config))]
+    names = [maker.name for maker in assemble_makers.map_makers(config, assemble.sensors(config))]
     assert names[-1] == "agreement"
     assert {"lines", "rooms"} <= set(names)
     off = config.model_copy(update={"agreement": config.agreement.model_copy(update={"enabled": False})})
-    assert "agreement" not in {maker.name for maker in assemble.map_makers(off, assemble.sensors(off))}
-    assert "agreement" not in {maker.name for maker in assemble.map_makers(Config(), {})}
+    assert "agreement" not in {maker.name for maker in assemble_makers.map_makers(off, assemble.sensors(off))}
+    assert "agreement" not in {maker.name for maker in assemble_makers.map_makers(Config(), {})}
     schema_kinds = SCHEMA["properties"]["kinds"]["items"]["properties"]["kind"]["enum"]
     assert sorted(schema_kinds) == sorted(KINDS)

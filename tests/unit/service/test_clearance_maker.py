@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from mapping.grids.patch import GridPatch
-from service import assemble
+from service import assemble_makers
 from service.clearance_maker import ClearanceMaker
 from service.config import Config
 from service.map_makers import MapView, Rect
@@ -131,6 +131,6 @@ def test_it_is_there_if_configured_and_if_there_is_a_grid() -> None:
         ({"clearance": {"enabled": True}, "grid": {"enabled": False}}, False),
     ):
         config = Config.model_validate(data)
-        assert ("clearance" in {maker.name for maker in assemble.map_makers(config, {})}) is is_there
+        assert ("clearance" in {maker.name for maker in assemble_makers.map_makers(config, {})}) is is_there
     with pytest.raises(ValueError, match="length above 0"):
         ClearanceMaker(reach_m=0.0)

@@ -16,7 +16,7 @@ from mapping.frames import IDENTITY, Pose2
 from mapping.grids.height import Ground
 from mapping.sectors.ground import SectorGround
 from mapping.sectors.snapshot import PolarSnapshot
-from service import assemble
+from service import assemble, assemble_makers
 from service.config import Config
 from service.elevation_maker import ElevationMaker
 from service.map_makers import MapMakers
@@ -267,10 +267,10 @@ def test_it_is_there_with_a_mount_and_only_then() -> None:
     data: dict[str, Any] = {"can": {"main": {"interface": "virtual"}}, "lasers": lasers}
     for more, is_there in (({}, False), ({"mounts": {"mast": mount}}, True)):
         config = Config.model_validate({**data, **more})
-        makers = assemble.map_makers(config, assemble.sensors(config))
+        makers = assemble_makers.map_makers(config, assemble.sensors(config))
         assert ("elevation" in {maker.name for maker in makers}) is is_there
-        assert (assemble.sector_ground(config, makers) is not None) is is_there
+        assert (assemble_makers.sector_ground(config, makers) is not None) is is_there
     off = Config.model_validate({**data, "mounts": {"mast": mount}, "elevation": {"enabled": False}})
-    assert assemble.sector_ground(off, assemble.map_makers(off, assemble.sensors(off))) is None
+    assert assemble_makers.sector_ground(off, assemble_makers.map_makers(off, assemble.sensors(off))) is None
     with pytest.raises(ValueError, match="150 x 150"):
         Config.model_validate({"elevation": {"size_m": 50.0}})

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drivers.readings import AngleReading, DeviceEvent, LinkState, ScanReading, WheelReading
 from mapping.frames import Pose2
-from service import assemble
+from service import assemble, assemble_makers
 from service.config import Config, load
 from service.errors import WrongUsage
 from service.fusion import Fusion, OdometryOnly
@@ -209,6 +209,8 @@ def test_a_tilted_laser_feeds_no_flat_map(tmp_path: Path) -> None:
     found = assemble.sensors(config)
     maps = assemble.maps(config, found)
     assert all("tilt" not in grid.sources for grid in maps.grids)
-    flat = [maker for maker in assemble.map_makers(config, found) if maker.name != "agreement"]  # which keeps no sweep
+    flat = [
+        maker for maker in assemble_makers.map_makers(config, found) if maker.name != "agreement"
+    ]  # which keeps no sweep
     assert all("tilt" not in maker.sources for maker in flat)
-    assert "planes" in {maker.name for maker in assemble.map_makers(config, found)}
+    assert "planes" in {maker.name for maker in assemble_makers.map_makers(config, found)}

@@ -9,7 +9,7 @@ import pytest
 
 from mapping.frames import Pose2
 from mapping.scan import Scan
-from service import assemble
+from service import assemble, assemble_makers
 from service.config import Config, check
 from service.config_files import read_layers
 from service.errors import WrongUsage
@@ -29,11 +29,13 @@ def room(stamp_ns: int) -> Scan:
 
 
 def test_it_is_built_from_the_configuration() -> None:
-    assert not any(maker.name == "places" for maker in assemble.map_makers(Config(), {}))
+    assert not any(maker.name == "places" for maker in assemble_makers.map_makers(Config(), {}))
     lasers = {"back": LASER, "front": {**LASER, "port": "/dev/other"}}
     for given, source in (({"enabled": True}, "back"), ({"enabled": True, "source": "front"}, "front")):
         config = Config.model_validate({"lasers": lasers, "places": given})
-        (maker,) = (m for m in assemble.map_makers(config, assemble.sensors(config)) if isinstance(m, PlaceMaker))
+        (maker,) = (
+            m for m in assemble_makers.map_makers(config, assemble.sensors(config)) if isinstance(m, PlaceMaker)
+        )
         assert maker.sources == {source}
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
-from service import assemble
+from service import assemble, assemble_makers
 from service.config import Config
 from service.map_makers import MapView, Rect
 from service.outputs import DocumentOut
@@ -268,7 +268,7 @@ def test_a_robot_whose_grid_a_laser_draws_has_rooms_without_being_told() -> None
     off = {"lasers": {"front": laser}, "rooms": {"enabled": False}}
     for given, has_rooms in ((here, True), (other, False), (off, False)):
         config = Config.model_validate(given)
-        makers = assemble.map_makers(config, assemble.sensors(config))
+        makers = assemble_makers.map_makers(config, assemble.sensors(config))
         assert any(isinstance(maker, RoomMaker) for maker in makers) is has_rooms
 
 
@@ -293,7 +293,7 @@ def test_outlines_of_rooms_that_stayed_are_those_worked_out_anew() -> None:
 
 
 def test_it_is_built_from_the_configuration() -> None:
-    assert not any(isinstance(maker, RoomMaker) for maker in assemble.map_makers(Config(), {}))
+    assert not any(isinstance(maker, RoomMaker) for maker in assemble_makers.map_makers(Config(), {}))
     config = Config.model_validate({"rooms": {"enabled": True, "period_s": 2.0}})
-    (maker,) = (m for m in assemble.map_makers(config, {}) if isinstance(m, RoomMaker))
+    (maker,) = (m for m in assemble_makers.map_makers(config, {}) if isinstance(m, RoomMaker))
     assert maker.period_ns == 2_000_000_000

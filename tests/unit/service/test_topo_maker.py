@@ -16,7 +16,7 @@ from jsonschema import Draft202012Validator
 from numpy.typing import NDArray
 
 from mapping.grids.patch import GridPatch
-from service import assemble
+from service import assemble_makers
 from service.config import Config
 from service.map_makers import MapView, Rect
 from service.outputs import DocumentOut
@@ -162,7 +162,7 @@ def test_no_way_says_so() -> None:
 
 
 def test_it_is_made_if_configured() -> None:
-    assert not any(isinstance(maker, TopoMaker) for maker in assemble.map_makers(Config(), {}))
+    assert not any(isinstance(maker, TopoMaker) for maker in assemble_makers.map_makers(Config(), {}))
     config = Config.model_validate({"topo": {"enabled": True, "period_s": 2.0}})
-    (maker,) = (m for m in assemble.map_makers(config, {}) if isinstance(m, TopoMaker))
+    (maker,) = (m for m in assemble_makers.map_makers(config, {}) if isinstance(m, TopoMaker))
     assert maker.period_ns == 2_000_000_000
