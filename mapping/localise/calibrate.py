@@ -145,6 +145,8 @@ def rolled_back(stamp_s: F64, pose: F64, model: RobotModel) -> WheelTicks:
 
     Exact for poses that such wheels made. Rows whose stamp does not rise are left out.
     """
+    if not len(stamp_s):
+        return WheelTicks(stamp_s, stamp_s, stamp_s)
     turn = wrap_angles(np.diff(pose[:, 2]))
     dx, dy = np.diff(pose[:, 0]), np.diff(pose[:, 1])
     heading = pose[:-1, 2] + 0.5 * turn

@@ -160,6 +160,19 @@ def test_wheels_worked_back_roll_as_odometry_did(seed: int) -> None:
     np.testing.assert_allclose(moved[:2], (ends.x_m, ends.y_m), atol=1e-6)
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_without_odometry_there_is_nothing_to_tell(count: int) -> None:
+    made = maker()
+    for k in range(count):
+        made.take_odometry(odom(k * S, Pose2()))
+    for k, pose in enumerate(turning(60)):
+        made.take_sweep("front", seen(pose, k * S), row(pose))
+    assert len(made.make(MapView(5, None, (), None))) == 1
+    found = made._lasers["front"].found
+    assert found is not None
+    assert not found.observable.any()
+
+
 def test_a_meter_without_a_sweep_before_says_nothing() -> None:
     meter = MotionMeter()
     scan = seen(Pose2(2.0, 2.0, 0.0), 0)
