@@ -39,7 +39,7 @@ def status(
     with Client(connect or daemon_endpoint(find_config(config))) as client:
         base = client.only_base(None if robot is None else f"robots/{robot}")
         values = {each.key.removeprefix(f"{base}/"): each.payload for each in client.get(f"{base}/health/json")}
-        for key in ("pose", "map/agreement"):
+        for key in ("pose", "map/agreement", "calibration"):
             values |= {each.key.removeprefix(f"{base}/"): each.payload for each in client.get(f"{base}/{key}")}
     if "health/json" not in values:
         raise Trouble(f"{base} has said nothing about its health yet; try again in a second")
@@ -47,6 +47,7 @@ def status(
     document["base"] = base
     document["pose"] = pose_in(values["pose"]) if "pose" in values else None
     document["agreement"] = json.loads(values["map/agreement"]) if "map/agreement" in values else None
+    document["calibration"] = json.loads(values["calibration"]) if "calibration" in values else None
     if as_json:
         typer.echo(json.dumps(document, indent=2))
     else:
@@ -78,6 +79,8 @@ def _print(document: Mapping[str, Any]) -> None:
     if (agreement := document["agreement"]) is not None:
         text = agreement_text(agreement)
         typer.secho(f"maps     {text}", fg="yellow" if agreement["disagreements"] else None)
+    if document["calibration"] is not None and (text := advice_text(document["calibration"])):
+        typer.secho(f"settings {text}", fg="yellow")
     rows = [("device", "kind", "state", "rate", "age", "drops", "identity")]
     rows += [_row(source) for source in document["sources"]]
     print_table(rows, [None, *(_LEVEL_COLOURS.get(source["level"]) for source in document["sources"])])
@@ -100,6 +103,17 @@ def agreement_text(agreement: Mapping[str, Any]) -> str:
     ]
     more = agreement["disagreements"] - len(first)
     return f"disagree: {'; '.join(first)}" + (f"; and {more} more" if more else "")
+
+
+def advice_text(calibration: Mapping[str, Any]) -> str:
+    """What the drive so far contradicts of the configuration; empty if nothing. Of several lasers the first to say."""
+    found: dict[str, str] = {}
+    for report in calibration["lasers"].values():
+        for each in report["advice"]:
+            found.setdefault(each["setting"], f"{each['value']} ± {each['deviation']}, not {each['instead_of']}")
+    if not found:
+        return ""
+    return "to look at: " + "; ".join(f"{setting} = {text}" for setting, text in found.items()) + " (umfeld calibrate)"
 
 
 def _row(source: Mapping[str, Any]) -> tuple[str, str, str, str, str, str, str]:

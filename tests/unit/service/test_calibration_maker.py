@@ -18,6 +18,7 @@ from mapping.odometry import DifferentialOdometry, DriveGeometry
 from mapping.scan import Scan
 from service.calibration_maker import CalibrationMaker, _Way
 from service.calibration_report import advice_of
+from service.commands.status import advice_text
 from service.map_makers import MapMakers, MapView
 from service.outputs import OdomOut
 from tests.unit.mapping.test_features_scenes import flat, scan_at
@@ -219,3 +220,11 @@ def test_a_new_finding_is_one_line_in_the_log(caplog: pytest.LogCaptureFixture) 
     assert [record.message for record in caplog.records] == [
         "calibration by front: the drive so far says drive.track_width_m = 0.42 ± 0.0004 instead of 0.4"
     ]
+
+
+def test_status_says_each_setting_once() -> None:
+    advice = [{"setting": "drive.track_width_m", "value": 0.41, "deviation": 0.001, "instead_of": 0.4}]
+    assert advice_text({"lasers": {"front": {"advice": []}}}) == ""
+    assert advice_text({"lasers": {"front": {"advice": advice}, "back": {"advice": advice}}}) == (
+        "to look at: drive.track_width_m = 0.41 ± 0.001, not 0.4 (umfeld calibrate)"
+    )
