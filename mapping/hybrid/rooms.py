@@ -24,6 +24,8 @@ I32 = NDArray[np.int32]
 
 
 _END_M = 0.1  # around the end of a critical line: what stands there
+_BESIDE_M = (0.2, 1.0)  # from a cut: where the wall that it ends at must be free on both sides
+_BEND_M = 0.2  # at a cut's other end: less free space than that beside it is a wall that goes straight on
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +41,8 @@ class RoomRules:
     the piece where that is less (narrow_weight) and more (wide_weight), and with the share of the smaller piece's
     outline that is open (open_weight). It falls with the clearance in metres (large_weight), and with the sharpness
     of the corners on both sides, of the blunter (jamb_weight, up to blunt_most) and the sharper one (edge_weight, up to
-    sharp_most). Above join it is no door.
+    sharp_most). And with the length of the wall that the cut ends at, free on both sides, beyond stub_m (stub_weight
+    by the metre, up to stub_most_m). Above join it is no door.
     """
 
     clutter_m: float = 1.0
@@ -55,6 +58,9 @@ class RoomRules:
     blunt_most: float = 1.4
     edge_weight: float = 0.35
     sharp_most: float = 1.5
+    stub_weight: float = 2.0
+    stub_m: float = 0.3
+    stub_most_m: float = 0.7
     join: float = 0.19
 
 
@@ -130,6 +136,7 @@ def find_rooms(
     count = kernels.flood(field.squared, order, rules.keep, rules.slack_m / d, basin)
     pieces = _Pieces(field, basin, count, d)
     pieces.join_small(rules.room_min_m2 / (d * d))
+    pieces.measure_stubs(basin, rules.stub_most_m)
     pieces.join_unconvincing(rules)
     labels = _number_rooms(basin, pieces, rules.room_min_m2 / (d * d))
     rooms = _describe(labels, field.squared, order, d)
@@ -176,18 +183,21 @@ def _enterable(field: DistanceField, width: float, corner: float, inside: Bools 
 
 @dataclass(slots=True)
 class _Cut:
-    """Between two pieces: clearance of the widest passage in cells, cells side by side, sharpness of its corners."""
+    """Between two pieces: clearance of the widest passage in cells, cells side by side, sharpness of its corners, and
+    how long a wall it ends at."""
 
     clearance: float
     length: float
     blunt: float
     sharp: float
+    stub_m: float = 0.0
 
     def join(self, other: _Cut) -> None:
         """Both lead to the same piece now; the wider says what the passage looks like."""
         self.length += other.length
         if other.clearance > self.clearance:
             self.clearance, self.blunt, self.sharp = other.clearance, other.blunt, other.sharp
+            self.stub_m = other.stub_m
 
 
 class _Pieces:
@@ -199,8 +209,8 @@ class _Pieces:
         self.into = list(range(count))
         self.cuts: list[dict[int, _Cut]] = [{} for _ in range(count)]
         self._cell_m = resolution_m
-        found = _contacts(basin, field.squared)
-        points, lengths, widest, first = _widest_contacts(found, count)
+        self._contacts = _contacts(basin, field.squared)
+        points, lengths, widest, first = _widest_contacts(self._contacts, count)
         ruled = np.zeros(basin.shape, dtype=np.int32)
         kernels.count_ruled(field.site, field.squared, ruled)
         sharpness = np.empty((len(points), 2))
@@ -229,6 +239,21 @@ class _Pieces:
             kept = self._join(k, widest)
             if self.area[kept] < cells:
                 heapq.heappush(waiting, (self.area[kept], kept))
+
+    def measure_stubs(self, basin: I32, most_m: float) -> None:
+        """Of all cuts there are now; basin as it was given."""
+        owner = np.array([self.piece_of(k) for k in range(len(self.into))], dtype=np.int32)
+        sides = np.sort(owner[self._contacts[:, : kernels.UPPER + 1]], axis=1)
+        apart = sides[:, 0] != sides[:, 1]
+        sides, cells = sides[apart], self._contacts[apart][:, [kernels.ROW, kernels.COL, kernels.SQUARED]]
+        order = np.lexsort((-cells[:, 2], sides[:, 1], sides[:, 0]))  # stable: reading order within
+        pairs, first = np.unique(sides[order], axis=0, return_index=True)
+        beside = np.arange(_BESIDE_M[0], _BESIDE_M[1] + 0.05, 0.1) / self._cell_m
+        length = np.empty(len(pairs))
+        most, bend = most_m / self._cell_m, _BEND_M / self._cell_m
+        kernels.stubs(basin, owner, cells[order], np.append(first, len(order)), beside, most, bend, length)
+        for (a, b), cells_long in zip(pairs.tolist(), length.tolist()):
+            self.cuts[a][b].stub_m = cells_long * self._cell_m
 
     def join_unconvincing(self, rules: RoomRules) -> None:
         """Join pieces while the least convincing cut is no door."""
@@ -266,6 +291,7 @@ class _Pieces:
             - rules.large_weight * cut.clearance * self._cell_m
             - rules.jamb_weight * min(cut.blunt, rules.blunt_most)
             - rules.edge_weight * min(cut.sharp, rules.sharp_most)
+            - rules.stub_weight * max(min(cut.stub_m, rules.stub_most_m) - rules.stub_m, 0.0)
         )
 
     def _join(self, a: int, b: int) -> int:

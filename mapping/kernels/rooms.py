@@ -9,6 +9,7 @@ Run the tests also with NUMBA_BOUNDSCHECK=1 (and a NUMBA_CACHE_DIR of its own) a
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -276,6 +277,80 @@ def jambs(site: Any, squared: Any, ruled: Any, points: Any, first: Any, reach: i
             sharpness[i, 0] += blunt
             sharpness[i, 1] += sharp
         sharpness[i] /= first[i + 1] - first[i]
+
+
+@njit(cache=True, nogil=True)
+def walk(basin: Any, owner: Any, r: Any, c: Any, step: Any, most: float) -> Any:
+    """Cells from (r, c) on in the direction step (row, col), up to `most`: how many until an obstacle, and how many
+    until another piece than the first cell's."""
+    rows, cols = basin.shape
+    own: Any = -1
+    n, inside = 0, -1
+    while n < most:
+        row, col = math.floor(r + step[0] * n + 0.5), math.floor(c + step[1] * n + 0.5)
+        if row < 0 or col < 0 or row >= rows or col >= cols or basin[row, col] < 0:
+            break
+        if n == 0:
+            own = owner[basin[row, col]]
+        if inside < 0 and owner[basin[row, col]] != own:
+            inside = n
+        n += 1
+    return n, inside if inside >= 0 else n
+
+
+@njit(cache=True, nogil=True)
+def farthest(cells: Any, begin: Any, end: Any, r: Any, c: Any, middle: Any, reach: float) -> Any:
+    """Which of cells[begin:end] is farthest from (r, c), within reach of cells[middle]; the first of equals."""
+    best, at = -1.0, begin
+    for k in range(begin, end):
+        if math.hypot(cells[k, 0] - cells[middle, 0], cells[k, 1] - cells[middle, 1]) > reach:
+            continue
+        d = math.hypot(cells[k, 0] - r, cells[k, 1] - c)
+        if d > best:
+            best, at = d, k
+    return at
+
+
+@njit(cache=True, nogil=True)
+def stubs(basin: Any, owner: Any, cells: Any, first: Any, beside: Any, most: float, bend: float, length: Any) -> None:
+    """How long a wall that a cut ends at runs on in the cut's direction, free on both sides.
+
+    owner: (N,) the piece of each basin.  cells: (K, 3) row, column and squared clearance of the contacts of cut i, from
+    first[i] to first[i + 1], widest first.  beside: (M,) how far from the cut, on each side of it and parallel with it,
+    is looked along, to at most `most` beyond its end.  length: (N,) out, cells, of the longer of both walls: as far as
+    it is free on all of these lines, on one side at least without leaving the piece there. 0 if at the other end it is
+    free by less than `bend` on half of the lines of either side: a wall that goes straight on, as of a corridor that
+    something juts out into.
+    """
+    free, within, turned = np.empty(2), np.empty(2), np.empty(2)
+    seen = np.empty(beside.size)
+    for i in range(first.size - 1):
+        length[i] = 0.0
+        begin, end = first[i], first[i + 1]
+        reach = 1.5 * math.sqrt(cells[begin, 2]) + 3.0  # a cut is slanted; the same two pieces may meet elsewhere, too
+        a = farthest(cells, begin, end, cells[begin, 0], cells[begin, 1], begin, reach)
+        b = farthest(cells, begin, end, cells[a, 0], cells[a, 1], begin, reach)
+        cut = math.hypot(cells[a, 0] - cells[b, 0], cells[a, 1] - cells[b, 1])
+        if cut < 1.0:
+            continue
+        for e in range(2):
+            tip, other = (a, b) if e == 0 else (b, a)
+            down, right = float(cells[tip, 0] - cells[other, 0]), float(cells[tip, 1] - cells[other, 1])
+            along = (down / cut, right / cut)
+            free[e], within[e], turned[e] = most, 0.0, 0.0
+            for side in (-1, 1):
+                own = most
+                for k in range(beside.size):  # from a quarter of the cut inside, lest the wall's rough end be hit
+                    r = cells[tip, 0] - 0.25 * down - side * beside[k] * along[1]
+                    c = cells[tip, 1] - 0.25 * right + side * beside[k] * along[0]
+                    n, inside = walk(basin, owner, r, c, along, most + 0.25 * cut)
+                    seen[k] = n - 0.25 * cut
+                    own = min(own, inside - 0.25 * cut)
+                free[e], within[e] = min(free[e], seen.min()), max(within[e], own)
+                turned[e] = max(turned[e], np.median(seen))
+        for e in range(2):
+            if turned[1 - e] >= bend:
+                length[i] = max(length[i], min(free[e], within[e]))
 
 
 @njit(cache=True, nogil=True)

@@ -222,3 +222,49 @@ def test_rooms_do_not_hang_on_the_cells(cell_m: float) -> None:
     else:
         free, truth = free[::2, ::2], truth[::2, ::2]
     check_rooms(find_rooms(free, cell_m), truth)
+
+
+def cubicles(*, stub: int) -> tuple[Bools, I32]:
+    """A corridor of 2.5 m and along it cells of 2.9 m by 2 m, open to it but for `stub` cells of wall on the right."""
+    truth = np.zeros((120, 365), dtype=np.int32)
+    truth[60:110, 10:355] = 1
+    for k in range(5):
+        truth[17:57, 30 + 61 * k : 88 + 61 * k] = k + 2
+    free = truth > 0
+    for k in range(5):
+        free[57:60, 30 + 61 * k : 88 + 61 * k - stub] = True
+    return free, truth
+
+
+@pytest.mark.parametrize("quarters", range(4))
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_cells_with_a_wall_in_front_are_rooms_and_bays_are_not(quarters: int, mirrored: bool) -> None:
+    """A bug: cells as deep as their opening is wide were taken for bays of the corridor."""
+    for stub, rooms in ((17, 6), (12, 6), (0, 1)):
+        free, truth = cubicles(stub=stub)
+        if mirrored:
+            free, truth = free[:, ::-1], truth[:, ::-1]
+        found = find_rooms(np.rot90(free, quarters), CELL_M)
+        assert len(found.rooms) == rooms
+        if stub:
+            assert sorted(numbers_in(found, np.rot90(truth, quarters))) == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_cut_that_ends_at_a_wall_tells_how_far_it_is_free_on_both_sides() -> None:
+    free = np.zeros((80, 100), dtype=np.bool_)
+    free[10:38, 10:50] = True  # the room, 14 cells beyond the opening on its left, none on its right
+    free[42:70, 10:90] = True
+    free[38:42, 24:50] = True
+    basin = np.where(free, 1, -1).astype(np.int32)
+    basin[:40][free[:40]] = 0
+    cells = np.array([[39, c, 100] for c in (36, *range(24, 36), *range(37, 50))], dtype=np.int32)
+    owner, first, beside = np.arange(2, dtype=np.int32), np.array([0, len(cells)]), np.array([4.0, 12.0, 20.0])
+    for most, pieces, expected in ((40.0, [0, 1], 14.0), (8.0, [0, 1], 8.0), (40.0, [0, 0], 14.0)):
+        owner[:] = pieces
+        length = np.empty(1)
+        kernels.stubs(basin, owner, cells, first, beside, most, 4.0, length)
+        assert length[0] == pytest.approx(expected, abs=1.0)
+    free[42:70, :24] = False  # below, the wall goes on to the opening
+    basin[~free] = -1
+    kernels.stubs(basin, owner, cells, first, beside, 40.0, 4.0, length)
+    assert length[0] < 1.0
