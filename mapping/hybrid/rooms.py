@@ -24,6 +24,7 @@ I32 = NDArray[np.int32]
 
 
 _END_M = 0.1  # around the end of a critical line: what stands there
+_AROUND_M = 0.15  # of two cells with as much clearance the one with more around it is wider
 _BESIDE_M = (0.2, 1.0)  # from a cut: where the wall that it ends at must be free on both sides
 _BEND_M = 0.2  # at a cut's other end: less free space than that beside it is a wall that goes straight on
 
@@ -50,18 +51,18 @@ class RoomRules:
     corner_m: float = 0.3
     keep: float = 0.95
     slack_m: float = 0.0125
-    narrow_weight: float = 0.4
-    wide_weight: float = 0.72
-    open_weight: float = 1.1
-    large_weight: float = 0.88
-    jamb_weight: float = 0.58
-    blunt_most: float = 1.4
-    edge_weight: float = 0.35
-    sharp_most: float = 1.5
-    stub_weight: float = 2.0
+    narrow_weight: float = 0.38
+    wide_weight: float = 0.75
+    open_weight: float = 0.93
+    large_weight: float = 0.96
+    jamb_weight: float = 0.53
+    blunt_most: float = 1.25
+    edge_weight: float = 0.23
+    sharp_most: float = 1.72
+    stub_weight: float = 2.7
     stub_m: float = 0.3
     stub_most_m: float = 0.7
-    join: float = 0.19
+    join: float = 0.27
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +133,7 @@ def find_rooms(
         open_space = _enterable(field, width_m / d, rules.corner_m / d, None if inside is None else np.pad(inside, 1))
         field = DistanceField(~open_space)
     basin = np.empty(open_space.shape, dtype=np.int32)
-    order = kernels.widest_first(field.squared)
+    order = kernels.widest_first(field.squared, round(_AROUND_M / d))
     count = kernels.flood(field.squared, order, rules.keep, rules.slack_m / d, basin)
     pieces = _Pieces(field, basin, count, d)
     pieces.join_small(rules.room_min_m2 / (d * d))

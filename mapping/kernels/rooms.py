@@ -94,8 +94,37 @@ def boxes(label: Any, box: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def widest_first(squared: Any) -> Any:
-    """Free cells as row * C + col by falling distance, equal ones in reading order: a counting sort."""
+def sums_around(squared: Any, around: int) -> Any:
+    """(R, C) int64: sum of the cells at most `around` rows and columns away, what is beyond the border 0."""
+    rows, cols = squared.shape
+    down = np.zeros((rows, cols), dtype=np.int64)
+    for r in range(min(around, rows)):
+        down[0] += squared[r]
+    for r in range(rows):
+        if r > 0:
+            down[r] = down[r - 1]
+            if r > around:
+                down[r] -= squared[r - around - 1]
+        if r + around < rows:
+            down[r] += squared[r + around]
+    sums = np.empty((rows, cols), dtype=np.int64)
+    for r in range(rows):
+        n = np.int64(0)
+        for c in range(min(around, cols)):
+            n += down[r, c]
+        for c in range(cols):
+            if c > around:
+                n -= down[r, c - around - 1]
+            if c + around < cols:
+                n += down[r, c + around]
+            sums[r, c] = n
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def widest_first(squared: Any, around: int) -> Any:
+    """Free cells as row * C + col by falling distance, equal ones by falling sum of distances at most `around` cells
+    away (else it would hang on how a map lies which of them is first), then in reading order."""
     rows, cols = squared.shape
     most = 0
     for r in range(rows):
@@ -115,6 +144,15 @@ def widest_first(squared: Any) -> Any:
                 k = most - squared[r, c]
                 order[begins[k]] = r * cols + c
                 begins[k] += 1
+    if around > 0:
+        sums = sums_around(squared, around).reshape(-1)
+        begin = 0
+        for k in range(most + 1):
+            end = begins[k]  # moved on to the next one's begin
+            if end - begin > 1:
+                equal = order[begin:end].copy()
+                order[begin:end] = equal[np.argsort(-sums[equal], kind="mergesort")]
+            begin = end
     return order
 
 

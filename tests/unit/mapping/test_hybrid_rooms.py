@@ -167,7 +167,7 @@ def test_basins_are_those_of_the_slow_flood(seed: int) -> None:
     free = np.pad(random.random((26, 34)) > 0.04, 1)
     squared = DistanceField(~free).squared
     basin = np.empty(free.shape, dtype=np.int32)
-    count = kernels.flood(squared, kernels.widest_first(squared), 0.8, 0.25, basin)
+    count = kernels.flood(squared, kernels.widest_first(squared, 0), 0.8, 0.25, basin)
     expected, met = literal_flood(squared, 0.8, 0.25)
     assert count == len(expected) > 2
     assert met
@@ -268,3 +268,15 @@ def test_a_cut_that_ends_at_a_wall_tells_how_far_it_is_free_on_both_sides() -> N
     basin[~free] = -1
     kernels.stubs(basin, owner, cells, first, beside, 40.0, 4.0, length)
     assert length[0] < 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("around", [0, 1, 3, 50])
+def test_cells_are_taken_by_clearance_then_by_what_is_around_them_then_in_reading_order(seed: int, around: int) -> None:
+    random = np.random.default_rng(seed)
+    squared = DistanceField(np.pad(random.random((20, 31)) > 0.1, 1) == 0).squared
+    size = 2 * around + 1
+    sums = ndimage.convolve(squared.astype(np.int64), np.ones((size, size), dtype=np.int64), mode="constant")
+    assert np.array_equal(kernels.sums_around(squared, around), sums)
+    expected = sorted(((-int(squared[r, c]), -int(sums[r, c]), r, c) for r, c in zip(*np.nonzero(squared))))
+    assert kernels.widest_first(squared, around).tolist() == [r * squared.shape[1] + c for _, _, r, c in expected]
