@@ -9,6 +9,7 @@ and, once pulled taut, most often is that. Nothing rests on it: what it does not
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from mapping.kernels.paths import distances_from
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
-LANDMARKS = 8
+LANDMARKS = kernels.MARKS
 
 _BULGE = 0.555  # of the window around a corner's cell that is open; before a straight wall it is half and a row
 _APART, _APART_CELLS = 0.7, 2.0  # between corners on one side, by the clearance
@@ -56,28 +57,32 @@ class CornerGraph:
         self.pair = self._links()
         self._join()
         count = len(self.place)
-        self._best, self._via = np.empty(count), np.empty(count, dtype=np.int32)
-        self._to_go = np.empty(count)
-        self._state, self._stamp = np.zeros(count, dtype=np.int32), 0
-        most = len(self._other) + count + 1
-        self._heap, self._key = np.empty(most, dtype=np.int32), np.empty(most)
-        self._to_end = np.full(count, _HUGE)
-        self._which, self._far = np.empty(count, dtype=np.int32), np.empty(count)
-        self._point, self._work = np.empty((count + 2, 2)), np.empty((count + 2, 2))
+        most = len(self._other) + 2 * count + 1
+        reach = np.full((count, 3), _HUGE, dtype=np.float32)
+        self._search = np.zeros((count, 2), dtype=np.int32)
+        self._stamp = 0
+        self._point = np.empty((count + 2, 2))
+        self._given = (
+            room, self._spot, self._tile, self._across, self._step, self._first, self._other, self._cost, reach,
+            self._search, np.empty(most, dtype=np.int32), np.empty(most), np.empty((2, count), dtype=np.int32),
+            np.empty((2, count)), self._point, np.empty_like(self._point), _PULLS,
+        )  # fmt: skip
 
     def way(self, begin: F64, end: F64) -> F64 | None:
         """Corners (N, 2) of a way between two open places (row, col in cells); None if none is known."""
         self._stamp += 2
-        n = int(
-            kernels.way_round(
-                self._room, self.place, self.outward, self._tile, self._across, self._step, self._first,
-                self._other, self._cost,
-                self._mark, begin, end, self._best, self._via, self._state, self._stamp,
-                self._to_go, self._heap, self._key, self._to_end, self._which, self._far, self._point,
-                self._work, _PULLS,
-            )
-        )  # fmt: skip
-        return self._point[:n].copy() if n else None
+        n = kernels.way_round(*self._given, self._stamp, begin[0], begin[1], end[0], end[1])
+        return self.last_way(n) if n else None
+
+    def last_way(self, count: int) -> F64:
+        """Corners (count, 2) of the way that was found last."""
+        return self._point[:count].copy()
+
+    def plan(self, given: tuple[Any, ...], begin: tuple[float, float], end: tuple[float, float]) -> tuple[Any, ...]:
+        """A way with its poses in one compiled call. given: what kernels.plan_round takes first; what it tells."""
+        self._stamp += 2
+        told: tuple[Any, ...] = kernels.plan_round(*given, *self._given, self._stamp, *begin, *end)
+        return told
 
     def _links(self) -> I32:
         pair = np.empty((8 * len(self.place) + 64, 2), dtype=np.int32)
@@ -96,9 +101,12 @@ class CornerGraph:
         order = np.argsort(ends, kind="stable")
         self._first = np.searchsorted(ends[order], np.arange(count + 1)).astype(np.int32)
         self._other = np.concatenate((pair[:, 1], pair[:, 0]))[order]
-        self._cost = np.concatenate((length, length))[order]
+        self._cost = np.concatenate((length, length))[order].astype(np.float32)
         link = np.tile(np.arange(len(pair), dtype=np.int32), 2)[order]
-        self._mark = landmarks(self._first, link, pair, length)
+        mark = landmarks(self._first, link, pair, length)
+        self._spot = np.zeros((count, kernels.MARK + kernels.MARKS), dtype=np.float32)
+        self._spot[:, : kernels.MARK] = np.concatenate((self.place, self.outward), axis=1)
+        self._spot[:, kernels.MARK : kernels.MARK + mark.shape[1]] = mark
 
 
 def landmarks(first: I32, link: I32, edge: I32, cost: F64) -> NDArray[np.float32]:

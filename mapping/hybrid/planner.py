@@ -30,6 +30,7 @@ HALF_CELLS = math.sqrt(2.0)
 _USED_AGAIN = 1.4  # what an edge of an earlier way costs in the search for others
 _ELSEWHERE = 0.3  # of an alternative's length, at least
 _PULLS = 2
+_APART_M = 0.5  # poses of a way, at most
 _CLEARANCES_KEPT = 3
 _NEAR_CELLS = 120  # ends nearer than this are joined on the grid, too, if the way is so much longer than straight on:
 _DETOUR = 1.1
@@ -135,6 +136,7 @@ class Planner:
         self._heap, self._key = np.empty(room, dtype=np.int32), np.empty(room)
         self._cells = np.empty(len(graph.chain) + len(graph.node), dtype=np.int32)
         self._used = np.empty(len(graph.edge), dtype=np.int32)
+        self._room_for_poses(1 << 10)
 
     def plan(
         self, start: tuple[float, float], goal: tuple[float, float], *, clearance_m: float = 0.0, alternatives: int = 2
@@ -147,7 +149,10 @@ class Planner:
         if not (math.isfinite(clearance_m) and clearance_m >= 0.0):
             raise ValueError(f"clearance_m is a length, got {clearance_m}")
         need = clearance_m / self.resolution_m + HALF_CELLS
-        begin, end = self._cell("start", start, need), self._cell("goal", goal, need)
+        first, last = self._cell("start", start, need), self._cell("goal", goal, need)
+        if alternatives == 0 and (way := self._round_corners(first, last, need)) is not None:
+            return Plan(way, ())
+        begin, end = np.array(first), np.array(last)
         pulled = self._ways(begin, end, need, alternatives)
         if not pulled:
             raise NoWayError(f"no way with {clearance_m:.2f} m of clearance leads from the start to the goal")
@@ -158,6 +163,17 @@ class Planner:
                 kept.append(corners)
         described = [self._describe(corners) for corners in kept]
         return Plan(described[0], tuple(described[1:]))
+
+    def _round_corners(self, begin: tuple[float, float], end: tuple[float, float], need: float) -> Way | None:
+        """The way from corner to corner, if it is known and nothing else is to be tried; all in one compiled call."""
+        tables = self._tables_for(need)
+        corners, poses, length_m, least_m = tables.corners.plan((tables.part, *self._to_describe), begin, end)
+        straight = math.dist(begin, end)
+        if corners == 0 or (straight <= _NEAR_CELLS and length_m > _DETOUR * straight * self.resolution_m):
+            return None
+        if poses > len(self._clear):
+            return self._describe(tables.corners.last_way(corners))
+        return Way(self._pose[:poses].copy(), length_m, self._clear[:poses].copy(), least_m)
 
     def _ways(self, begin: F64, end: F64, need: float, alternatives: int) -> list[F64]:
         """Corners of ways that are pulled taut, in any order; none only if the grid has none."""
@@ -187,7 +203,7 @@ class Planner:
         """Make now what the first plan with this clearance would have to wait for."""
         self._tables_for(clearance_m / self.resolution_m + HALF_CELLS)
 
-    def _cell(self, what: str, place: tuple[float, float], need: float) -> F64:
+    def _cell(self, what: str, place: tuple[float, float], need: float) -> tuple[float, float]:
         """(row, col) in cells, a cell's centre at whole numbers; NoWayError if it is not free enough."""
         if not (math.isfinite(place[0]) and math.isfinite(place[1])):
             raise ValueError(f"the {what} is no position: {place}")
@@ -195,16 +211,17 @@ class Planner:
         at_col = place[0] / self.resolution_m - self.col0 - 0.5
         row, col = math.floor(at_row + 0.5), math.floor(at_col + 0.5)
         height, width = self.grid.shape
-        if not (0 <= row < height and 0 <= col < width) or self.grid.field.squared[row, col] == 0:
+        inside = 0 <= row < height and 0 <= col < width
+        clear = math.sqrt(self.grid.field.squared.item(row, col)) if inside else 0.0
+        if clear == 0.0:
             raise NoWayError(f"the {what} ({place[0]:.2f}, {place[1]:.2f}) is not known to be free")
-        clear = math.sqrt(self.grid.field.squared[row, col])
         if clear < need:
             have = max(clear - HALF_CELLS, 0.0) * self.resolution_m
             raise NoWayError(
                 f"the {what} ({place[0]:.2f}, {place[1]:.2f}) has {have:.2f} m of clearance, "
                 f"asked are {(need - HALF_CELLS) * self.resolution_m:.2f} m"
             )
-        return np.array((at_row, at_col))
+        return at_row, at_col
 
     def _candidates(self, begin: F64, end: F64, need: float, tries: int) -> list[I32]:
         """Ways from cell to cell on the graph, shortest first."""
@@ -344,21 +361,21 @@ class Planner:
         n = int(kernels.taut(self._tables_for(need).room, points, n, _PULLS, work))
         return points[:n].copy()
 
+    def _room_for_poses(self, count: int) -> None:
+        self._pose, self._clear = np.empty((count, 3)), np.empty(count)
+        self._to_describe = (
+            self.grid.field.squared, _APART_M / self.resolution_m, self.resolution_m, float(self.row0),
+            float(self.col0), HALF_CELLS, self._pose, self._clear,
+        )  # fmt: skip
+
     def _describe(self, corners: F64) -> Way:
         """Poses at the corners and between them, at most half a metre apart."""
-        squared, d = self.grid.field.squared, self.resolution_m
-        spacing = 0.5 / d
-        length = float(kernels.length_of(corners, len(corners)))
-        most = int(length / spacing) + 2 * len(corners) + 2
-        pose, clear = np.empty((most, 3)), np.empty(most)
-        n = int(kernels.describe(squared, corners, len(corners), spacing, pose, clear, np.empty((most, 2))))
-        poses = np.empty((n, 3))
-        poses[:, 0] = (pose[:n, 1] + (0.5 + self.col0)) * d
-        poses[:, 1] = (pose[:n, 0] + (0.5 + self.row0)) * d
-        poses[:, 2] = pose[:n, 2]
-        clearance = np.maximum(clear[:n] - HALF_CELLS, 0.0) * d
-        least = max(math.sqrt(kernels.least_along(squared, corners, len(corners))) - HALF_CELLS, 0.0) * d
-        return Way(poses, length * d, clearance, least)
+        squared, *others = self._to_describe
+        n, length_m, least_m = kernels.describe(squared, corners, len(corners), *others)
+        if n > len(self._clear):
+            self._room_for_poses(2 * n)
+            return self._describe(corners)
+        return Way(self._pose[:n].copy(), length_m, self._clear[:n].copy(), least_m)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,8 @@
     place   (N, 2) int32    cells that ways go round or through, sorted by tiles of TILE cells
     outward (N, 2) float64  away from what a way goes round there, 0 in the middle of a narrow passage
     first   (tiles + 1,) int32  the places of tile t are first[t] to first[t + 1]
+    spot    (N, 4 + MARKS) float32  what a search asks of a place, side by side in memory: its cell, outward, and the
+                              shortest way from each landmark (0 where there are fewer landmarks)
 
 Run the tests also with NUMBA_BOUNDSCHECK=1 (and a NUMBA_CACHE_DIR of its own) and with NUMBA_DISABLE_JIT=1.
 """
@@ -19,11 +21,15 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from mapping.kernels.paths import _FAR_AWAY, pop, push, sees_by_room, still_to_go, taut
+from mapping.kernels.paths import _FAR_AWAY, describe, pop, push, sees_by_room, taut
 from mapping.kernels.rooms import critical_line
 
 TILE = 50
 SECTORS = 64
+MARKS = 8
+ROW, COL, OUT_ROW, OUT_COL, MARK = range(5)  # columns of spot
+BEST, TO_GO, TO_END = range(3)
+STATE, VIA = range(2)
 _ROUND = 0.9  # a way that comes from straight in front of a corner (cosine above this) need not go round it
 _EAGER = 1.02  # what is still to go counts so much more: fewer places are looked at for a way of about the same length
 _FAILS = 12  # so many places of a sector out of sight, and the others are not looked at
@@ -265,97 +271,164 @@ def link_places(room: Any, place: Any, outward: Any, first: Any, across: int, st
 
 
 @njit(cache=True, nogil=True)
-def places_in_sight(
-    room: Any, place: Any, outward: Any, first: Any, across: int, step: float, r: float, c: float, which: Any, far: Any
+def places_around(
+    room: Any, spot: Any, tile: Any, across: int, step: float, r: float, c: float, which: Any, far: Any
 ) -> Any:
-    """Places that are seen from a point and that a way from there may go round: how many.
+    """Places that may be seen from a point and that a way from there may go round: how many. Sight is not looked at.
 
     which: (N,) int32, far: (N,) float64, out: their numbers and distances.
     """
-    n, down = 0, (first.size - 1) // across
+    n, down = 0, (tile.size - 1) // across
     span, box = np.empty(SECTORS), np.empty(4)
     look_around(room, r, c, 0.0, 0.0, step, span, box)
     left, right = max(int(box[2]) // TILE, 0), min(int(box[3]) // TILE, across - 1)
     for a in range(max(int(box[0]) // TILE, 0), min(int(box[1]) // TILE, down - 1) + 1):
         for b in range(left, right + 1):
-            if first[a * across + b] == first[a * across + b + 1] or beyond(span, r, c, a, b):
+            if tile[a * across + b] == tile[a * across + b + 1] or beyond(span, r, c, a, b):
                 continue
-            for j in range(first[a * across + b], first[a * across + b + 1]):
-                dr, dc = place[j, 0] - r, place[j, 1] - c
+            for j in range(tile[a * across + b], tile[a * across + b + 1]):
+                dr, dc = spot[j, ROW] - r, spot[j, COL] - c
                 length = math.sqrt(dr * dr + dc * dc)
-                if -dr * outward[j, 0] - dc * outward[j, 1] > _ROUND * length:
+                if -dr * spot[j, OUT_ROW] - dc * spot[j, OUT_COL] > _ROUND * length:
                     continue
-                if length > span[sector_of(dr, dc)]:
-                    continue
-                if sees_by_room(room, r, c, float(place[j, 0]), float(place[j, 1])):
+                if length <= span[sector_of(dr, dc)]:
                     which[n], far[n] = j, length
                     n += 1
     return n
 
 
 @njit(cache=True, nogil=True)
+def from_marks(room: Any, spot: Any, r: float, c: float, n: int, which: Any, far: Any, from_mark: Any) -> None:
+    """from_mark: (MARKS,) float32 out, shortest way from each landmark to a point by what it sees of n places around.
+
+    far: of those found to be out of sight it becomes huge. Only the nearest by way of a landmark are looked for.
+    """
+    looked = np.zeros(n, dtype=np.bool_)
+    for k in range(MARKS):
+        while True:
+            nearest, least = -1, np.float64(0.5 * _FAR_AWAY)
+            for i in range(n):
+                there = spot[which[i], MARK + k] + far[i]
+                if there < least:
+                    nearest, least = i, there
+            if nearest < 0:
+                from_mark[k] = _FAR_AWAY
+                break
+            j = which[nearest]
+            if not looked[nearest] and not sees_by_room(room, r, c, spot[j, ROW], spot[j, COL]):
+                far[nearest] = _FAR_AWAY
+                continue
+            looked[nearest] = True
+            from_mark[k] = least
+            break
+
+
+@njit(cache=True, nogil=True)
+def eager_bound(spot: Any, n: int, r: float, c: float, from_mark: Any) -> float:
+    """What is still to go from place n to a point, at least, as paths.still_to_go; _EAGER times that."""
+    bound = np.float32(0.0)
+    for k in range(MARKS):
+        apart = abs(from_mark[k] - spot[n, MARK + k])
+        if apart > bound:
+            bound = apart
+    dr, dc = spot[n, ROW] - r, spot[n, COL] - c
+    straight = math.sqrt(dr * dr + dc * dc)
+    by_marks = 0.9999 * bound  # what 32 bits may have rounded up
+    if bound > 0.5 * _FAR_AWAY or by_marks < straight:
+        by_marks = straight
+    return _EAGER * by_marks
+
+
+@njit(cache=True, nogil=True)
 def way_round(
-    room: Any, place: Any, outward: Any, tile: Any, across: int, step: float, first: Any, other: Any,
-    cost: Any, mark: Any, begin: Any, end: Any, best: Any, via: Any, state: Any, stamp: int, to_go: Any,
-    heap: Any, key: Any, to_end: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
+    room: Any, spot: Any, tile: Any, across: int, step: float, first: Any, other: Any, cost: Any, reach: Any,
+    search: Any, heap: Any, key: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
+    stamp: int, r0: float, c0: float, r1: float, c1: float,
 ) -> Any:  # fmt: skip
     """The shortest way from place to place between two points, pulled taut; how many points it has, 0 if there is none.
 
     tile: the places of each tile.  first, other, cost: places joined with place n are other[first[n] : first[n + 1]].
-    mark: from paths.distances_from.  begin, end: (2,) row, col, open.  to_end: (N,) huge before and after.  best, via,
-    to_go, state, heap, key, which, far, work: work, the state as in paths.shortest_way.  point: (N + 2, 2) out.
+    r0, c0, r1, c1: begin and end, open.  point: (N + 2, 2) out.  reach: (N, 3) float32, columns BEST, TO_GO, TO_END,
+    the last huge before and after.  search: (N, 2) int32, columns STATE and VIA; states of this search are stamp and
+    stamp + 1, all others are less.  heap, key, which (2, N), far (2, N), work: work.
+
+    Whether the ends see a place is looked at only where a shortest way would begin or end with it.
     """
-    if sees_by_room(room, begin[0], begin[1], end[0], end[1]):
-        point[0] = begin
-        point[1] = end
+    point[0, 0], point[0, 1], point[1, 0], point[1, 1] = r0, c0, r1, c1
+    if sees_by_room(room, r0, c0, r1, c1):
         return 2
     met, done = stamp, stamp + 1
     size = np.zeros(1, dtype=np.int64)
-    from_mark = np.full(mark.shape[1], np.float32(_FAR_AWAY))
-    ends = places_in_sight(room, place, outward, tile, across, step, end[0], end[1], which, far)
+    from_mark = np.empty(MARKS, dtype=np.float32)
+    seeds = places_around(room, spot, tile, across, step, r0, c0, which[0], far[0])
+    ends = places_around(room, spot, tile, across, step, r1, c1, which[1], far[1])
+    from_marks(room, spot, r1, c1, ends, which[1], far[1], from_mark)
     for i in range(ends):
-        to_end[which[i]] = far[i]
-        for k in range(mark.shape[1]):
-            from_mark[k] = min(from_mark[k], mark[which[i], k] + np.float32(far[i]))
-    last_seen = which[:ends].copy()
-    seeds = places_in_sight(room, place, outward, tile, across, step, begin[0], begin[1], which, far)
-    if ends == 0:
-        return 0
+        reach[which[1, i], TO_END] = far[1, i]
     for i in range(seeds):
-        n = which[i]
-        best[n], state[n], via[n] = far[i], met, -1
-        to_go[n] = _EAGER * still_to_go(mark, n, place, end, from_mark)
-        push(heap, key, size, far[i] + to_go[n], n)
+        push(heap, key, size, far[0, i] + eager_bound(spot, which[0, i], r1, c1, from_mark), -1 - i)
     last, total = -1, _FAR_AWAY
     while size[0] > 0 and key[0] < total:
         n = pop(heap, key, size)
-        if state[n] == done:
+        if n < 0:  # straight from the beginning
+            i = -1 - n
+            n = which[0, i]
+            if search[n, STATE] == done or not sees_by_room(room, r0, c0, spot[n, ROW], spot[n, COL]):
+                continue
+            reach[n, BEST], search[n, VIA] = far[0, i], -1
+        elif search[n, STATE] == done:
             continue
-        state[n] = done
-        if best[n] + to_end[n] < total:
-            last, total = n, best[n] + to_end[n]
+        search[n, STATE] = done
+        here = np.float64(reach[n, BEST])
+        if here + reach[n, TO_END] < total:
+            if sees_by_room(room, spot[n, ROW], spot[n, COL], r1, c1):
+                last, total = n, here + reach[n, TO_END]
         for i in range(first[n], first[n + 1]):
             m = other[i]
-            reached = best[n] + cost[i]
-            if state[m] < met or (state[m] == met and reached < best[m]):
-                if state[m] < met:
-                    to_go[m] = _EAGER * still_to_go(mark, m, place, end, from_mark)
-                best[m], state[m], via[m] = reached, met, n
-                if reached + to_go[m] < total:
-                    push(heap, key, size, reached + to_go[m], m)
+            reached = here + cost[i]
+            state = search[m, STATE]
+            if state < met or (state == met and reached < reach[m, BEST]):
+                if state < met:
+                    reach[m, TO_GO] = eager_bound(spot, m, r1, c1, from_mark)
+                reach[m, BEST], search[m, STATE], search[m, VIA] = reached, met, n
+                if reached + reach[m, TO_GO] < total:
+                    push(heap, key, size, reached + reach[m, TO_GO], m)
     for i in range(ends):
-        to_end[last_seen[i]] = _FAR_AWAY
+        reach[which[1, i], TO_END] = _FAR_AWAY
     if last < 0:
         return 0
     n = 2
     k = last
-    while via[k] >= 0:
+    while search[k, VIA] >= 0:
         n += 1
-        k = via[k]
-    point[n] = end
-    point[0] = begin
+        k = search[k, VIA]
+    point[n, 0], point[n, 1] = r1, c1
     k = last
     for i in range(n - 1, 0, -1):
-        point[i, 0], point[i, 1] = place[k, 0], place[k, 1]
-        k = via[k]
+        point[i, 0], point[i, 1] = spot[k, ROW], spot[k, COL]
+        k = search[k, VIA]
     return taut(room, point, n + 1, rounds, work)
+
+
+@njit(cache=True, nogil=True)
+def plan_round(
+    part: Any, squared: Any, spacing: float, cell_m: float, row0: float, col0: float, less: float, pose: Any, clear: Any,
+    room: Any, spot: Any, tile: Any, across: int, step: float, first: Any, other: Any, cost: Any, reach: Any,
+    search: Any, heap: Any, key: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
+    stamp: int, r0: float, c0: float, r1: float, c1: float,
+) -> Any:  # fmt: skip
+    """A whole plan in one call: what way_round finds between open places, and of it what paths.describe tells.
+
+    part: (R, C) int32, cells of one number hang together.  Number of corners (0 if no way is known), number of poses,
+    length and least clearance in metres.
+    """
+    n = 0
+    if part[int(r0 + 0.5), int(c0 + 0.5)] == part[int(r1 + 0.5), int(c1 + 0.5)]:
+        n = way_round(
+            room, spot, tile, across, step, first, other, cost, reach, search, heap, key, which, far, point, work,
+            rounds, stamp, r0, c0, r1, c1,
+        )  # fmt: skip
+    if n == 0:
+        return 0, 0, 0.0, 0.0
+    m, length, least = describe(squared, point, n, spacing, cell_m, row0, col0, less, pose, clear)
+    return n, m, length, least

@@ -616,20 +616,6 @@ def straighten(room: Any, point: Any, n: int, out: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def refine(point: Any, n: int, spacing: float, out: Any) -> Any:
-    """The same way with points no farther apart than spacing; how many. out: long enough."""
-    m = 0
-    for i in range(n - 1):
-        dr, dc = point[i + 1, 0] - point[i, 0], point[i + 1, 1] - point[i, 1]
-        parts = int(math.hypot(dr, dc) / spacing) + 1
-        for k in range(parts):
-            out[m, 0], out[m, 1] = point[i, 0] + dr * k / parts, point[i, 1] + dc * k / parts
-            m += 1
-    out[m] = point[n - 1]
-    return m + 1
-
-
-@njit(cache=True, nogil=True)
 def length_of(point: Any, n: int) -> float:
     """Of a way of n points."""
     total = 0.0
@@ -703,8 +689,12 @@ def taut(room: Any, point: Any, n: int, rounds: int, work: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def least_along(squared: Any, point: Any, n: int) -> Any:
-    """Least squared distance of the cells that a way of n points crosses."""
+    """Least squared distance of the cells that a way of n points crosses.
+
+    Where obstacles are far, the way is followed in steps within which none can be nearer than the nearest so far.
+    """
     least = np.int64(squared[math.floor(point[0, 0] + 0.5), math.floor(point[0, 1] + 0.5)])
+    root = math.sqrt(least)
     for i in range(n - 1):
         r0, c0, r1, c1 = point[i, 0], point[i, 1], point[i + 1, 0], point[i + 1, 1]
         dr, dc = r1 - r0, c1 - c0
@@ -715,7 +705,25 @@ def least_along(squared: Any, point: Any, n: int) -> Any:
         step_r, step_c = (1 if dr > 0.0 else -1), (1 if dc > 0.0 else -1)
         leave_r = (0.5 + step_r * (r - r0)) * per_r
         leave_c = (0.5 + step_c * (c - c0)) * per_c
-        while min(leave_r, leave_c) < length:
+        on = 0.0
+        while True:
+            value = np.int64(squared[r, c])
+            if value < least:
+                least, root = value, math.sqrt(value)
+            leave = max(min(leave_r, leave_c), on)
+            far = root + 3.4143
+            if value > far * far:  # as in `sees`, of which `on` is known, too
+                t = leave + math.sqrt(value) - root - 2.8285
+                if t >= length:
+                    break
+                if t > leave:
+                    on = t
+                    r, c = math.floor(r0 + t / length * dr + 0.5), math.floor(c0 + t / length * dc + 0.5)
+                    leave_r = (0.5 + step_r * (r - r0)) * per_r
+                    leave_c = (0.5 + step_c * (c - c0)) * per_c
+                    continue
+            if min(leave_r, leave_c) >= length:
+                break
             if abs(leave_r - leave_c) < 1e-6:
                 r, c = r + step_r, c + step_c
                 leave_r, leave_c = leave_r + per_r, leave_c + per_c
@@ -723,28 +731,47 @@ def least_along(squared: Any, point: Any, n: int) -> Any:
                 r, leave_r = r + step_r, leave_r + per_r
             else:
                 c, leave_c = c + step_c, leave_c + per_c
-            least = min(least, np.int64(squared[r, c]))
         least = min(least, np.int64(squared[math.floor(r1 + 0.5), math.floor(c1 + 0.5)]))
+        root = math.sqrt(least)
     return least
 
 
 @njit(cache=True, nogil=True)
-def describe(squared: Any, corner: Any, n: int, spacing: float, pose: Any, clear: Any, point: Any) -> Any:
-    """Poses along a way of n corners, no farther apart than spacing: how many.
+def clear_at(squared: Any, r: float, c: float) -> float:
+    """Distance from a point to obstacles' cells; on the border of cells, what holds for one of them holds."""
+    top, bottom = math.floor(r + 0.5 - 1e-9), math.floor(r + 0.5 + 1e-9)
+    left, right = math.floor(c + 0.5 - 1e-9), math.floor(c + 0.5 + 1e-9)
+    most = squared[top, left]
+    if bottom != top or right != left:
+        most = max(max(most, squared[top, right]), max(squared[bottom, left], squared[bottom, right]))
+    return math.sqrt(most)
 
-    point: (K, 2) work.  pose: (K, 3) out, row, col and the angle of going on, from columns to rows.  clear: (K,) out,
-    distance from obstacles' cells. All in cells.
+
+@njit(cache=True, nogil=True)
+def describe(
+    squared: Any, corner: Any, n: int, spacing: float, cell_m: float, row0: float, col0: float, less: float,
+    pose: Any, clear: Any,
+) -> Any:  # fmt: skip
+    """Poses along a way of n corners, no farther apart than spacing (cells): how many, the way's length and the least
+    clearance of all cells that it crosses, both in metres.
+
+    row0, col0: of the grid on the map, cells.  less: cells that clearance is less than a distance between centres.
+    pose: (K, 3) out, x, y in metres and yaw along the way.  clear: (K,) out, metres.  What does not fit is counted only.
     """
-    m = refine(corner, n, spacing, point)
-    for i in range(m):
-        pose[i, 0], pose[i, 1] = point[i, 0], point[i, 1]
-        clear[i] = 0.0
-        for side in range(4):  # on the border of cells, what holds for one of them holds
-            r = math.floor(point[i, 0] + 0.5 + (1e-9 if side < 2 else -1e-9))
-            c = math.floor(point[i, 1] + 0.5 + (1e-9 if side % 2 == 0 else -1e-9))
-            clear[i] = max(clear[i], math.sqrt(squared[r, c]))
-        if i < m - 1:
-            pose[i, 2] = math.atan2(point[i + 1, 0] - point[i, 0], point[i + 1, 1] - point[i, 1])
-        else:
-            pose[i, 2] = pose[i - 1, 2] if m > 1 else 0.0
-    return m
+    m, total, yaw = 0, 0.0, 0.0
+    for i in range(n):
+        parts, dr, dc = 1, 0.0, 0.0
+        if i < n - 1:
+            dr, dc = corner[i + 1, 0] - corner[i, 0], corner[i + 1, 1] - corner[i, 1]
+            length = math.hypot(dr, dc)
+            parts = int(length / spacing) + 1
+            yaw = math.atan2(dr, dc)
+            total += length
+        for k in range(parts):
+            if m < pose.shape[0]:
+                r, c = corner[i, 0] + dr * k / parts, corner[i, 1] + dc * k / parts
+                pose[m, 0], pose[m, 1], pose[m, 2] = (c + 0.5 + col0) * cell_m, (r + 0.5 + row0) * cell_m, yaw
+                clear[m] = max(clear_at(squared, r, c) - less, 0.0) * cell_m
+            m += 1
+    least = max(math.sqrt(least_along(squared, corner, n)) - less, 0.0) * cell_m
+    return m, total * cell_m, least
