@@ -55,23 +55,25 @@ class CornerGraph:
         tiles = self._across * (room.shape[0] // kernels.TILE + 1)
         self._tile = np.searchsorted(tile[order], np.arange(tiles + 1)).astype(np.int32)
         self.pair = self._links()
-        self._join()
+        spot, first, link = self._join()
         count = len(self.place)
-        most = len(self._other) + 2 * count + 1
-        reach = np.full((count, 3), _HUGE, dtype=np.float32)
-        self._search = np.zeros((count, 2), dtype=np.int32)
+        most = len(link) + 2 * count + 1
+        search = np.zeros((count, 4), dtype=np.int32)
+        search.view(np.float32)[:, kernels.TO_END] = _HUGE
+        spot, self._first, link, search = _side_by_side(spot, first, link, search)
         self._stamp = 0
         self._point = np.empty((count + 2, 2))
-        self._given = (
-            room, self._spot, self._tile, self._across, self._step, self._first, self._other, self._cost, reach,
-            self._search, np.empty(most, dtype=np.int32), np.empty(most), np.empty((2, count), dtype=np.int32),
-            np.empty((2, count)), self._point, np.empty_like(self._point), _PULLS,
+        self._given: tuple[Any, ...] = (
+            room, spot, self._first, link, search, self._tile, self._across, self._step, link.view(np.float32),
+            search.view(np.float32), np.empty(most, dtype=np.int32), np.empty(most),
+            np.empty((2, count), dtype=np.int32), np.empty((2, count)), self._point, np.empty_like(self._point), _PULLS,
         )  # fmt: skip
 
     def way(self, begin: F64, end: F64) -> F64 | None:
         """Corners (N, 2) of a way between two open places (row, col in cells); None if none is known."""
         self._stamp += 2
-        n = kernels.way_round(*self._given, self._stamp, begin[0], begin[1], end[0], end[1])
+        given: tuple[Any, ...] = (*self._given, self._stamp, *begin.tolist(), *end.tolist())
+        n = int(kernels.way_round(*given))
         return self.last_way(n) if n else None
 
     def last_way(self, count: int) -> F64:
@@ -81,7 +83,8 @@ class CornerGraph:
     def plan(self, given: tuple[Any, ...], begin: tuple[float, float], end: tuple[float, float]) -> tuple[Any, ...]:
         """A way with its poses in one compiled call. given: what kernels.plan_round takes first; what it tells."""
         self._stamp += 2
-        told: tuple[Any, ...] = kernels.plan_round(*given, *self._given, self._stamp, *begin, *end)
+        given = (*given, *self._given, self._stamp, *begin, *end)
+        told: tuple[Any, ...] = kernels.plan_round(*given)
         return told
 
     def _links(self) -> I32:
@@ -94,19 +97,36 @@ class CornerGraph:
                 return pair[:m].copy()
             pair = np.empty((m, 2), dtype=np.int32)
 
-    def _join(self) -> None:
+    def _join(self) -> tuple[NDArray[np.float32], I32, I32]:
+        """What kernels.way_round calls spot, first and link."""
         count, pair = len(self.place), self.pair
         length = np.hypot(*(self.place[pair[:, 0]] - self.place[pair[:, 1]]).astype(np.float64).T)
         ends = np.concatenate((pair[:, 0], pair[:, 1]))
         order = np.argsort(ends, kind="stable")
-        self._first = np.searchsorted(ends[order], np.arange(count + 1)).astype(np.int32)
-        self._other = np.concatenate((pair[:, 1], pair[:, 0]))[order]
-        self._cost = np.concatenate((length, length))[order].astype(np.float32)
-        link = np.tile(np.arange(len(pair), dtype=np.int32), 2)[order]
-        mark = landmarks(self._first, link, pair, length)
-        self._spot = np.zeros((count, kernels.MARK + kernels.MARKS), dtype=np.float32)
-        self._spot[:, : kernels.MARK] = np.concatenate((self.place, self.outward), axis=1)
-        self._spot[:, kernels.MARK : kernels.MARK + mark.shape[1]] = mark
+        first = np.searchsorted(ends[order], np.arange(count + 1)).astype(np.int32)
+        link = np.empty((len(ends), 2), dtype=np.int32)
+        link[:, kernels.OTHER] = np.concatenate((pair[:, 1], pair[:, 0]))[order]
+        link.view(np.float32)[:, kernels.COST] = np.concatenate((length, length))[order]
+        mark = landmarks(first, np.tile(np.arange(len(pair), dtype=np.int32), 2)[order], pair, length)
+        spot = np.zeros((count, kernels.SPOT), dtype=np.float32)
+        spot[:, : kernels.MARK] = np.concatenate((self.place, self.outward), axis=1)
+        spot[:, kernels.MARK : kernels.MARK + mark.shape[1]] = mark
+        return spot, first, link
+
+
+def _side_by_side(*arrays: NDArray[Any]) -> list[NDArray[Any]]:
+    """Copies in one block of memory, each from a line of the cache on. numpy asks for large pages for a block of more
+    than 4 MB: what a search reads here and there is then found without walks through page tables."""
+    line, room = 64, 1 << 22
+    begin = np.cumsum([0] + [-(-array.nbytes // line) * line for array in arrays])
+    block = np.empty(int(begin[-1]) + line + room, dtype=np.uint8)
+    skipped = -block.ctypes.data % line
+    copies = []
+    for at, array in zip(begin.tolist(), arrays):
+        part = block[skipped + at : skipped + at + array.nbytes]
+        copies.append(part.view(array.dtype).reshape(array.shape))
+        copies[-1][...] = array
+    return copies
 
 
 def landmarks(first: I32, link: I32, edge: I32, cost: F64) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -363,7 +364,7 @@ class Planner:
 
     def _room_for_poses(self, count: int) -> None:
         self._pose, self._clear = np.empty((count, 3)), np.empty(count)
-        self._to_describe = (
+        self._to_describe: tuple[Any, ...] = (
             self.grid.field.squared, _APART_M / self.resolution_m, self.resolution_m, float(self.row0),
             float(self.col0), HALF_CELLS, self._pose, self._clear,
         )  # fmt: skip

@@ -7,7 +7,7 @@
     place   (N, 2) int32    cells that ways go round or through, sorted by tiles of TILE cells
     outward (N, 2) float64  away from what a way goes round there, 0 in the middle of a narrow passage
     first   (tiles + 1,) int32  the places of tile t are first[t] to first[t + 1]
-    spot    (N, 4 + MARKS) float32  what a search asks of a place, side by side in memory: its cell, outward, and the
+    spot    (N, SPOT) float32  what a search asks of a place, side by side in memory: its cell, outward, and the
                               shortest way from each landmark (0 where there are fewer landmarks)
 
 Run the tests also with NUMBA_BOUNDSCHECK=1 (and a NUMBA_CACHE_DIR of its own) and with NUMBA_DISABLE_JIT=1.
@@ -28,8 +28,9 @@ TILE = 50
 SECTORS = 64
 MARKS = 8
 ROW, COL, OUT_ROW, OUT_COL, MARK = range(5)  # columns of spot
-BEST, TO_GO, TO_END = range(3)
-STATE, VIA = range(2)
+SPOT = 16  # of these, so that each place has a line of the cache
+STATE, VIA, BEST, TO_END = range(4)  # columns of search (the first two) and reach
+OTHER, COST = range(2)  # columns of link and cost
 _ROUND = 0.9  # a way that comes from straight in front of a corner (cosine above this) need not go round it
 _EAGER = 1.02  # what is still to go counts so much more: fewer places are looked at for a way of about the same length
 _FAILS = 12  # so many places of a sector out of sight, and the others are not looked at
@@ -333,24 +334,23 @@ def eager_bound(spot: Any, n: int, r: float, c: float, from_mark: Any) -> float:
             bound = apart
     dr, dc = spot[n, ROW] - r, spot[n, COL] - c
     straight = math.sqrt(dr * dr + dc * dc)
-    by_marks = 0.9999 * bound  # what 32 bits may have rounded up
-    if bound > 0.5 * _FAR_AWAY or by_marks < straight:
-        by_marks = straight
-    return _EAGER * by_marks
+    by_marks = np.float64(0.9999 * bound)  # what 32 bits may have rounded up
+    return _EAGER * (straight if bound > 0.5 * _FAR_AWAY or by_marks < straight else by_marks)
 
 
 @njit(cache=True, nogil=True)
 def way_round(
-    room: Any, spot: Any, tile: Any, across: int, step: float, first: Any, other: Any, cost: Any, reach: Any,
-    search: Any, heap: Any, key: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
+    room: Any, spot: Any, first: Any, link: Any, search: Any, tile: Any, across: int, step: float, cost: Any,
+    reach: Any, heap: Any, key: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
     stamp: int, r0: float, c0: float, r1: float, c1: float,
 ) -> Any:  # fmt: skip
     """The shortest way from place to place between two points, pulled taut; how many points it has, 0 if there is none.
 
-    tile: the places of each tile.  first, other, cost: places joined with place n are other[first[n] : first[n + 1]].
-    r0, c0, r1, c1: begin and end, open.  point: (N + 2, 2) out.  reach: (N, 3) float32, columns BEST, TO_GO, TO_END,
-    the last huge before and after.  search: (N, 2) int32, columns STATE and VIA; states of this search are stamp and
-    stamp + 1, all others are less.  heap, key, which (2, N), far (2, N), work: work.
+    tile: the places of each tile.  first, link: of place n link[first[n] : first[n + 1]], column OTHER the place it is
+    joined with; cost: the same memory as float32, column COST how far that is.  search: (N, 4) int32, columns STATE
+    and VIA, states of this search are stamp and stamp + 1, all others are less; reach: the same memory as float32,
+    columns BEST and TO_END, the latter huge before and after.  heap, key, which (2, N), far (2, N), work: work.
+    r0, c0, r1, c1: begin and end, open.  point: (N + 2, 2) out.
 
     Whether the ends see a place is looked at only where a shortest way would begin or end with it.
     """
@@ -368,6 +368,7 @@ def way_round(
     for i in range(seeds):
         push(heap, key, size, far[0, i] + eager_bound(spot, which[0, i], r1, c1, from_mark), -1 - i)
     last, total = -1, _FAR_AWAY
+    better, promise = np.empty(64, dtype=np.int32), np.empty(64)
     while size[0] > 0 and key[0] < total:
         n = pop(heap, key, size)
         if n < 0:  # straight from the beginning
@@ -380,19 +381,26 @@ def way_round(
             continue
         search[n, STATE] = done
         here = np.float64(reach[n, BEST])
-        if here + reach[n, TO_END] < total:
-            if sees_by_room(room, spot[n, ROW], spot[n, COL], r1, c1):
-                last, total = n, here + reach[n, TO_END]
-        for i in range(first[n], first[n + 1]):
-            m = other[i]
-            reached = here + cost[i]
-            state = search[m, STATE]
-            if state < met or (state == met and reached < reach[m, BEST]):
-                if state < met:
-                    reach[m, TO_GO] = eager_bound(spot, m, r1, c1, from_mark)
-                reach[m, BEST], search[m, STATE], search[m, VIA] = reached, met, n
-                if reached + reach[m, TO_GO] < total:
-                    push(heap, key, size, reached + reach[m, TO_GO], m)
+        if here + reach[n, TO_END] < total and sees_by_room(room, spot[n, ROW], spot[n, COL], r1, c1):
+            last, total = n, here + reach[n, TO_END]
+        # First which, then how far, then all else: loads that wait for nothing but memory go side by side.
+        begin, k = first[n], 0
+        if first[n + 1] - begin > better.size:
+            better = np.empty(first[n + 1] - begin, dtype=np.int32)
+            promise = np.empty(better.size)
+        for i in range(begin, first[n + 1]):
+            m = link[i, OTHER]
+            better[k] = i
+            k += (search[m, STATE] < met) | ((search[m, STATE] == met) & (here + cost[i, COST] < reach[m, BEST]))
+        for j in range(k):
+            i = better[j]
+            promise[j] = here + cost[i, COST] + eager_bound(spot, link[i, OTHER], r1, c1, from_mark)
+        for j in range(k):
+            i = better[j]
+            m = link[i, OTHER]
+            reach[m, BEST], search[m, STATE], search[m, VIA] = here + cost[i, COST], met, n
+            if promise[j] < total:
+                push(heap, key, size, promise[j], m)
     for i in range(ends):
         reach[which[1, i], TO_END] = _FAR_AWAY
     if last < 0:
@@ -412,9 +420,9 @@ def way_round(
 
 @njit(cache=True, nogil=True)
 def plan_round(
-    part: Any, squared: Any, spacing: float, cell_m: float, row0: float, col0: float, less: float, pose: Any, clear: Any,
-    room: Any, spot: Any, tile: Any, across: int, step: float, first: Any, other: Any, cost: Any, reach: Any,
-    search: Any, heap: Any, key: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
+    part: Any, squared: Any, spacing: float, cell_m: float, row0: float, col0: float, less: float, pose: Any,
+    clear: Any, room: Any, spot: Any, first: Any, link: Any, search: Any, tile: Any, across: int, step: float,
+    cost: Any, reach: Any, heap: Any, key: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
     stamp: int, r0: float, c0: float, r1: float, c1: float,
 ) -> Any:  # fmt: skip
     """A whole plan in one call: what way_round finds between open places, and of it what paths.describe tells.
@@ -425,7 +433,7 @@ def plan_round(
     n = 0
     if part[int(r0 + 0.5), int(c0 + 0.5)] == part[int(r1 + 0.5), int(c1 + 0.5)]:
         n = way_round(
-            room, spot, tile, across, step, first, other, cost, reach, search, heap, key, which, far, point, work,
+            room, spot, first, link, search, tile, across, step, cost, reach, heap, key, which, far, point, work,
             rounds, stamp, r0, c0, r1, c1,
         )  # fmt: skip
     if n == 0:

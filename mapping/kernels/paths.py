@@ -756,7 +756,7 @@ def describe(
     clearance of all cells that it crosses, both in metres.
 
     row0, col0: of the grid on the map, cells.  less: cells that clearance is less than a distance between centres.
-    pose: (K, 3) out, x, y in metres and yaw along the way.  clear: (K,) out, metres.  What does not fit is counted only.
+    pose: (K, 3) out, x, y in metres and yaw along the way.  clear: (K,) out, metres.  What does not fit is counted.
     """
     m, total, yaw = 0, 0.0, 0.0
     for i in range(n):
