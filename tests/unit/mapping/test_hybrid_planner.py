@@ -289,3 +289,16 @@ def test_sight_along_the_borders_of_cells_comes_to_an_end() -> None:
         for a, b in ((10.0, 180.5), (180.5, 10.0)):
             assert kernels.sees_by_room(room, a, at, b, at)
             assert kernels.sees(tall, 3.0, a, at, b, at)
+
+
+def test_a_way_of_more_poses_than_there_is_room_for() -> None:
+    """Work arrays hold 1,024 poses at first; both ways of planning tell all of a longer way."""
+    free = np.zeros((20, 150), dtype=np.bool_)
+    free[2:-2, 2:-2] = True
+    ends = (17.5, 47.5), (700.0, 52.5)
+    for alternatives in (0, 1):
+        plan = Planner(VoronoiGrid(free), 5.0).plan(*ends, alternatives=alternatives)
+        assert len(plan.way.poses) == len(plan.way.clearance_m) > 1024
+        assert plan.way.length_m == pytest.approx(math.dist(*ends))
+        assert plan.way.poses[0, :2] == pytest.approx(ends[0])
+        assert plan.way.poses[-1, :2] == pytest.approx(ends[1])
