@@ -9,8 +9,9 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -58,15 +59,26 @@ _LONGEST_SCAN_PERIOD_NS = 10 * _NANOS
 _UNEVEN = 0.25  # of the angle between beams: what still counts as evenly spaced
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Message:
-    """One sample to publish: suffix is the key below the base, stamp_ns wall clock."""
+    """One sample to publish: suffix is the key below the base, stamp_ns wall clock.
+
+    body: the payload, or what makes it of values that stay as they are: for keys that most of the time nobody reads.
+    """
 
     topic: Topic
     suffix: str
-    payload: bytes
+    body: bytes | Callable[[], bytes]
     stamp_ns: int
     attachment: bytes | None = None
+
+    @property
+    def payload(self) -> bytes:
+        """The bytes, made when they are first asked for. Two threads that ask at once make the same."""
+        body = self.body
+        if not isinstance(body, bytes):
+            body = self.body = body()
+        return body
 
     @property
     def encoding(self) -> str:
@@ -176,8 +188,8 @@ class Encoder:
         beams = self._beams.get(out.sensor)
         if beams is None or beams.bearing_rad is not out.scan.bearing_rad:
             beams = self._beams[out.sensor] = Beams.of(out.scan.bearing_rad)
-        payload = cdr.encode_laser(laser_message(out.scan, out.sensor, stamp_ns, scan_time_s, beams=beams))
-        return Message(topics.SCAN, f"scan/{out.sensor}", payload, stamp_ns)
+        body = partial(_laser_bytes, out.scan, out.sensor, stamp_ns, scan_time_s, beams)
+        return Message(topics.SCAN, f"scan/{out.sensor}", body, stamp_ns)
 
     def _cloud(self, out: CloudOut, offset_ns: int) -> Message:
         stamp_ns = out.stamp_ns + offset_ns
@@ -190,12 +202,8 @@ class Encoder:
         known = self._polar_heads.get(out.name)
         if known is None or known[0] != fingerprint:
             known = self._polar_heads[out.name] = (fingerprint, _polar_heads(snap.edges_rad))
-        text = _document_head("polar", out.name, stamp_ns, self._frames.base, snap.base_from_sensor)
-        sectors = _polar_sectors(snap, known[1])
-        if out.ground is not None:
-            sectors = _with_ground(sectors, out.ground)
-        text += ",".join(sectors) + "]}"
-        return Message(topics.POLAR, f"sectors/polar/{out.name}", text.encode(), stamp_ns)
+        body = partial(_polar_document, out.name, snap, known[1], out.ground, stamp_ns, self._frames.base)
+        return Message(topics.POLAR, f"sectors/polar/{out.name}", body, stamp_ns)
 
     def _rect(self, out: RectOut, offset_ns: int) -> Message:
         snap, stamp_ns = out.snapshot, out.snapshot.stamp_ns + offset_ns
@@ -203,12 +211,8 @@ class Encoder:
         known = self._rect_heads.get(out.name)
         if known is None or known[0] != fingerprint:
             known = self._rect_heads[out.name] = (fingerprint, _rect_heads(snap.x_edges_m, snap.y_edges_m))
-        rows, columns = snap.state.shape
-        text = _document_head(
-            "rect", out.name, stamp_ns, self._frames.base, snap.base_from_sensor, rows=rows, columns=columns
-        )
-        text += ",".join(_rect_sectors(snap, known[1])) + "]}"
-        return Message(topics.RECT, f"sectors/rect/{out.name}", text.encode(), stamp_ns)
+        body = partial(_rect_document, out.name, snap, known[1], stamp_ns, self._frames.base)
+        return Message(topics.RECT, f"sectors/rect/{out.name}", body, stamp_ns)
 
     def _odom(self, out: OdomOut, offset_ns: int) -> list[Message]:
         stamp_ns, pose = out.stamp_ns + offset_ns, out.odom_from_base
@@ -247,20 +251,16 @@ class Encoder:
         ]
 
     def _transform(self, stamp_ns: int, frame: str, child: str, pose: Pose2) -> Message:
-        transform = cdr.Transform(stamp_ns, frame, child, (pose.x_m, pose.y_m, 0.0), _quaternion(pose.yaw_rad))
-        return Message(topics.TF_KEY, "tf", cdr.encode_transforms([transform]), stamp_ns)
+        return Message(topics.TF_KEY, "tf", partial(_transform_bytes, stamp_ns, frame, child, pose), stamp_ns)
 
     def _ranges(self, out: RangesOut, offset_ns: int) -> list[Message]:
         stamp_ns = out.stamp_ns + offset_ns
-        document = _json(ranges_document(out, stamp_ns, self._frames.base))
+        document = partial(_ranges_bytes, out, stamp_ns, self._frames.base)
         messages = [Message(topics.RANGES, f"range/{out.sensor}", document, stamp_ns)]
         if self._range_messages:
-            for number, range_m in enumerate(out.range_m, start=1):
-                one = cdr.RangeOne(
-                    stamp_ns, f"{out.sensor}_{number}", out.cone_rad, out.range_min_m, out.range_max_m, range_m
-                )
-                suffix = f"range/{out.sensor}/{number}"
-                messages.append(Message(topics.RANGE_ONE, suffix, cdr.encode_range(one), stamp_ns))
+            for number in range(1, len(out.range_m) + 1):
+                body = partial(_range_bytes, out, number, stamp_ns)
+                messages.append(Message(topics.RANGE_ONE, f"range/{out.sensor}/{number}", body, stamp_ns))
         return messages
 
     def _full_grid(self, out: GridOut, offset_ns: int) -> Message:
@@ -424,6 +424,15 @@ def _even_bins(bearing_rad: F64, range_m: F32) -> tuple[F32, float, float]:
     return bins, low, high - low
 
 
+def _laser_bytes(scan: Scan, frame: str, stamp_ns: int, scan_time_s: float, beams: Beams) -> bytes:
+    return cdr.encode_laser(laser_message(scan, frame, stamp_ns, scan_time_s, beams=beams))
+
+
+def _transform_bytes(stamp_ns: int, frame: str, child: str, pose: Pose2) -> bytes:
+    transform = cdr.Transform(stamp_ns, frame, child, (pose.x_m, pose.y_m, 0.0), _quaternion(pose.yaw_rad))
+    return cdr.encode_transforms([transform])
+
+
 def grid_message(patch: GridPatch, frame: str, frame_from_grid: Pose2, stamp_ns: int) -> cdr.Grid:
     """A grid as OccupancyGrid: row 0 lowest, origin at the lower left corner of the first cell."""
     origin = grid_origin(patch, frame_from_grid)
@@ -451,6 +460,17 @@ def ranges_document(out: RangesOut, stamp_ns: int, base_frame: str) -> dict[str,
             for number, (pose, range_m) in enumerate(zip(out.base_from_transducer, out.range_m), start=1)
         ],
     }
+
+
+def _ranges_bytes(out: RangesOut, stamp_ns: int, base_frame: str) -> bytes:
+    return _json(ranges_document(out, stamp_ns, base_frame))
+
+
+def _range_bytes(out: RangesOut, number: int, stamp_ns: int) -> bytes:
+    """One transducer of a round, numbered from 1."""
+    range_m, frame = out.range_m[number - 1], f"{out.sensor}_{number}"
+    one = cdr.RangeOne(stamp_ns, frame, out.cone_rad, out.range_min_m, out.range_max_m, range_m)
+    return cdr.encode_range(one)
 
 
 def _range_status(range_m: float) -> str:
@@ -571,6 +591,22 @@ def _status_of(source: SourceHealth) -> cdr.Status:
 
 
 # The sector documents go out at up to 40 Hz each: they are written as text, with what never changes kept ready.
+
+
+def _polar_document(
+    name: str, snap: PolarSnapshot, heads: Sequence[str], ground: SectorGround | None, stamp_ns: int, frame: str
+) -> bytes:
+    text = _document_head("polar", name, stamp_ns, frame, snap.base_from_sensor)
+    sectors = _polar_sectors(snap, heads)
+    if ground is not None:
+        sectors = _with_ground(sectors, ground)
+    return (text + ",".join(sectors) + "]}").encode()
+
+
+def _rect_document(name: str, snap: RectSnapshot, heads: Sequence[str], stamp_ns: int, frame: str) -> bytes:
+    rows, columns = snap.state.shape
+    text = _document_head("rect", name, stamp_ns, frame, snap.base_from_sensor, rows=rows, columns=columns)
+    return (text + ",".join(_rect_sectors(snap, heads)) + "]}").encode()
 
 
 def _document_head(kind: str, name: str, stamp_ns: int, frame: str, origin: Pose2, **more: int) -> str:

@@ -283,8 +283,10 @@ class Publisher:
         kept = self._last.get(message.suffix)
         if kept is None or kept.message is not message:
             self._last[message.suffix] = _Kept(message)
-        self._publisher_of(message).put(message.payload, encoding=message.encoding, attachment=message.attachment)
-        self._counts["sent"] += 1
+        publisher = self._publisher_of(message)
+        if message.topic.cached or zenoh_session.is_read(publisher):
+            publisher.put(message.payload, encoding=message.encoding, attachment=message.attachment)
+            self._counts["sent"] += 1
         if self._ros is not None:
             self._ros.publish(message)
         for tap in self._taps:
