@@ -80,9 +80,9 @@ IDENTITY = Pose2()
 
 def exp_se2(twist: ArrayLike) -> Pose2:
     """The motion along a constant twist (vx, vy, w) for unit time: an arc. Inverse of log_se2 for |w| < pi."""
-    vx, vy, w = np.asarray(twist, dtype=np.float64)
-    a, b = _arc_coefficients(float(w))
-    return Pose2(float(a * vx - b * vy), float(b * vx + a * vy), wrap_angle(float(w)))
+    vx, vy, w = np.asarray(twist, dtype=np.float64).tolist()
+    a, b = _arc_coefficients(w)
+    return Pose2(a * vx - b * vy, b * vx + a * vy, wrap_angle(w))
 
 
 def log_se2(pose: Pose2) -> F64:

@@ -9,7 +9,7 @@ Field orders: the .msg files of common_interfaces, geometry2 and navigation_msgs
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -174,9 +174,8 @@ class _Writer:
     def stamp(self, stamp_ns: int) -> None:
         self.pack(4, "<iI", *divmod(stamp_ns, _NANOS))
 
-    def doubles(self, values: Iterable[float]) -> None:
-        self.align(8)
-        self.buf += np.fromiter(values, dtype="<f8").tobytes()
+    def doubles(self, values: Sequence[float]) -> None:
+        self.pack(8, f"<{len(values)}d", *values)
 
     def matrix(self, values: F64) -> None:
         self.align(8)

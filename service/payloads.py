@@ -51,6 +51,7 @@ UPDATE_CELLS_MAX = 32_000  # with the header below 32 KB
 GRID_ATTACHMENT = struct.Struct("<QQ")
 """Epoch of the full grid, number of the update within it (from 1; 0 on the full grid itself)."""
 
+_UNKNOWN_COVARIANCE = np.zeros((6, 6))
 _LEVELS = ("ok", "warning", "error", "stale")
 _STATES = {state.value: state.name.lower() for state in SectorState}
 _CAN_DRIVE = {Ground.TRAVERSABLE.value: "true", Ground.UNKNOWN.value: "null"}
@@ -226,7 +227,7 @@ class Encoder:
                 _planar_covariance(out.covariance),
                 (out.forward_m_s, 0.0, 0.0),
                 (0.0, 0.0, out.yaw_rad_s),
-                np.zeros((6, 6)),
+                _UNKNOWN_COVARIANCE,
             )
         )
         return [
@@ -572,8 +573,12 @@ def _quaternion(yaw_rad: float) -> cdr.Quaternion:
 
 def _planar_covariance(covariance: F64) -> F64:
     """(3, 3) of x, y, yaw into the (6, 6) of x, y, z, roll, pitch, yaw; what a planar vehicle cannot do is 0."""
+    if covariance.shape != (3, 3):
+        raise ValueError(f"a covariance of x, y, yaw is (3, 3), not {covariance.shape}")
     wide = np.zeros((6, 6))
-    wide[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
+    wide[:2, :2], wide[:2, 5], wide[5, :2], wide[5, 5] = (
+        covariance[:2, :2], covariance[:2, 2], covariance[2, :2], covariance[2, 2],
+    )  # fmt: skip
     return wide
 
 

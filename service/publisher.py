@@ -284,7 +284,7 @@ class Publisher:
         if kept is None or kept.message is not message:
             self._last[message.suffix] = _Kept(message)
         publisher = self._publisher_of(message)
-        if message.topic.cached or zenoh_session.is_read(publisher):
+        if message.topic.cached or zenoh_session.is_read(publisher):  # a cache must hold it for late joiners
             publisher.put(message.payload, encoding=message.encoding, attachment=message.attachment)
             self._counts["sent"] += 1
         if self._ros is not None:

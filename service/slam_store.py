@@ -39,6 +39,7 @@ KEYS_A_TILE = 64
 KEPT_A_TILE = 128
 _KEYS, _GRAPH, _KEPT, _BASE = range(4)
 _POINT_M = 1e-3
+_PACKING = 1  # zlib's level; every few seconds the newest tiles are packed anew
 _PLACE = struct.Struct("<qq")
 
 
@@ -267,7 +268,10 @@ def _round_of(document: list[Any]) -> KeptRound:
 
 def _pack(**arrays: NDArray[Any]) -> bytes:
     out = io.BytesIO()
-    np.savez_compressed(out, **arrays)  # type: ignore[arg-type]
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=_PACKING) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
     return out.getvalue()
 
 

@@ -24,7 +24,17 @@ from service.outputs import GridOut, GridUpdateOut, HealthOut, Output, PoseOut, 
 from service.payloads import RobotInfo
 from service.publisher import Publisher
 from service.rpc import CallRefused
-from service.zenoh_session import CallFailed, Client, NetworkSettings, NetworkTrouble, NoDaemon, PortInUse, received
+from service.zenoh_session import (
+    CallFailed,
+    Client,
+    NetworkSettings,
+    NetworkTrouble,
+    NoDaemon,
+    PortInUse,
+    closing,
+    open_router,
+    received,
+)
 
 BASE = "robots/r1"
 
@@ -148,6 +158,39 @@ def test_get_gives_the_last_values_on_their_own_keys(publisher: Publisher, clien
     assert [answer.key for answer in client.get(f"{BASE}/map/**")] == [f"{BASE}/map/grid"]
     assert client.get(f"{BASE}/nothing") == []
     assert client.get("robots/other/**") == []
+
+
+def test_what_nobody_reads_is_not_sent_and_get_has_it(publisher: Publisher, client: Client) -> None:
+    for stamp_ns in range(1, 20):
+        publisher.offer(scan_out(stamp_ns))
+    publisher.offer(health_out())  # cached for those who come later: always sent
+    wait_until(lambda: publisher.counters().get("sent"))
+    (answer,) = client.get(f"{BASE}/scan/front")
+    stamp_ns = cdr.decode_laser(answer.payload).stamp_ns
+    assert abs(stamp_ns - 19 - SystemClock().wall_from_monotonic_ns(0)) < 1_000_000_000
+    assert publisher.counters()["sent"] == 2  # health and health/json
+    subscriber = client.subscribe(f"{BASE}/scan/*")
+    offer_until_it_arrives(publisher, scan_out(), subscriber)
+    subscriber.undeclare()
+    sent = -1
+
+    def is_quiet() -> bool:
+        nonlocal sent
+        before, sent = sent, publisher.counters()["sent"]
+        publisher.offer(scan_out())
+        return sent == before
+
+    wait_until(is_quiet)
+
+
+def test_a_reader_behind_another_router_counts(publisher: Publisher, endpoint: str) -> None:
+    """A fleet's router that is linked to the daemon's: what is read there is sent."""
+    there = free_endpoint()
+    settings = NetworkSettings(listen=(there,), connect=(endpoint,))
+    with closing(open_router(settings)), Client(there) as far:
+        subscriber = far.subscribe(f"{BASE}/scan/*")
+        samples = offer_until_it_arrives(publisher, scan_out(), subscriber)
+    assert samples[0].key == f"{BASE}/scan/front"
 
 
 def test_get_converts_the_grid(publisher: Publisher, client: Client) -> None:

@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from mapping.frames import Pose2, wrap_angle
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
+from mapping.sectors.polar import PolarSectors
+from mapping.sectors.rectangular import RectSectors
 from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot, SectorState
 from service import cdr, topics
 from service.outputs import (
@@ -30,7 +32,7 @@ from service.outputs import (
     ScanOut,
     SourceHealth,
 )
-from service.payloads import GRID_ATTACHMENT, Encoder, RobotInfo, SensorPlace, laser_message
+from service.payloads import GRID_ATTACHMENT, Encoder, Message, RobotInfo, SensorPlace, laser_message
 
 OFFSET = 1_700_000_000_000_000_000
 
@@ -146,6 +148,39 @@ def test_polar_document_says_what_the_snapshot_says(count: int, seed: int) -> No
         age = snapshot.age_ns[i]
         assert sector["age_s"] == (None if age < 0 else pytest.approx(age / 1e9, abs=1e-3))
         assert sector["source"] == (None if snapshot.source[i] < 0 else snapshot.sources[0])
+
+
+def test_a_payload_is_made_when_it_is_asked_for_and_once() -> None:
+    made: list[bytes] = []
+
+    def make() -> bytes:
+        made.append(b"bytes")
+        return made[-1]
+
+    message = Message(topics.SCAN, "scan/front", make, 0)
+    assert not made
+    assert message.payload is message.payload is made[0]
+    assert len(made) == 1
+
+
+def test_what_is_encoded_later_says_what_was_so_then() -> None:
+    """Nothing that comes after an output changes its message: it may be made long after, for a get()."""
+    sectors: list[PolarSectors | RectSectors] = [PolarSectors(sources=("front",)), RectSectors(sources=("front",))]
+    encoder, bearing = Encoder(), np.linspace(-2.0, 2.0, 1081)
+    texts: list[bytes] = []
+    waiting: list[Message] = []
+    for k in range(4):
+        for each in sectors:
+            each.update_beams(
+                "front", base_from_sensor=Pose2(0.1 * k, 0.0, 0.2 * k), bearing_rad=bearing,
+                range_m=np.full(1081, 1.0 + 0.3 * k), range_min_m=0.1, range_max_m=30.0, stamp_ns=k * 25_000_000,
+            )  # fmt: skip
+            snapshot = each.snapshot(k * 25_000_000)
+            output = PolarOut("laser", snapshot) if isinstance(snapshot, PolarSnapshot) else RectOut("r", snapshot)
+            texts += [message.payload for message in encoder.encode(output, OFFSET)]
+            waiting += encoder.encode(output, OFFSET)
+    assert [message.payload for message in waiting] == texts
+    assert len(set(texts)) == len(texts)
 
 
 def test_polar_document_follows_changed_edges() -> None:
