@@ -22,6 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from mapping.grids.evidence import FREE, OCCUPIED, PARTLY_FREE, UNKNOWN
 from mapping.grids.geometry import check_resolution
 from mapping.kernels import octree as kernels
+from mapping.kernels import octree_ends as ends
+from mapping.kernels import octree_marks as marking
 from mapping.kernels import octree_rays as rays
 
 F64 = NDArray[np.float64]
@@ -88,12 +90,12 @@ class _Marks:
     def __init__(self, room: int) -> None:
         self.touched: I64 = np.zeros(room, dtype=np.int64)
         self.left: I32 = np.zeros(room, dtype=np.int32)
-        self.marks: U64 = np.zeros(room * rays.WORDS, dtype=np.uint64)
-        self.shortcuts: I64 = np.full((rays.SHORTCUTS, 2), -1, dtype=np.int64)
+        self.marks: U64 = np.zeros(room * marking.WORDS, dtype=np.uint64)
+        self.shortcuts: I64 = np.full((marking.SHORTCUTS, 2), -1, dtype=np.int64)
 
     def grow(self, room: int) -> None:
         self.touched, self.left = _longer(self.touched, room), _longer(self.left, room)
-        self.marks = _longer(self.marks, room * rays.WORDS)
+        self.marks = _longer(self.marks, room * marking.WORDS)
 
     def arrays(self) -> tuple[I64, I32, U64, I64]:
         return self.touched, self.left, self.marks, self.shortcuts
@@ -181,28 +183,28 @@ class Octree:
         members, fans = np.empty((n, 2), dtype=np.int32), np.empty((n, 4), dtype=np.float32)
         grouped = (runs, groups, members, fans)
         table = np.full(1 << (2 * n - 1).bit_length(), -1, dtype=np.int32)
-        count = np.zeros(rays.COUNT_LENGTH, dtype=np.int64)
+        count = np.zeros(ends.COUNT_LENGTH, dtype=np.int64)
         some, slope = np.empty(n, dtype=np.int32), np.empty((n, 2))
         keep = self._lowest - kernels.UNIFORM
 
         done, full = 0, False
         while done < n:
-            done = rays.mark_ends(
+            done = ends.mark_ends(
                 done, full, *cloud, *self._tree(), *marks.arrays(), *grouped, table, count, self._path, refused
             )  # fmt: skip
             full = done < n and not self._grow(marks)
         for first_only in (True, False):
             done, full = 0, False
-            while done < count[rays.GROUPS]:
+            while done < count[ends.GROUPS]:
                 done = rays.mark_ways(
                     done, full, first_only, _LEAST, *cloud, keep, *self._tree(), *marks.arrays(), *grouped, count,
                     some, slope, self._path, refused,
                 )  # fmt: skip
-                full = done < count[rays.GROUPS] and not self._grow(marks)
-        self.rejected_points += int(count[rays.SAID_NOTHING])
+                full = done < count[ends.GROUPS] and not self._grow(marks)
+        self.rejected_points += int(count[ends.SAID_NOTHING])
         self.refused_rays += int(np.count_nonzero(refused))
         self._touched_before = max(64, int(1.25 * self._state[kernels.TOUCHED]))
-        rays.settle(
+        marking.settle(
             self._hit, self._miss, self._lowest, self._highest, *self._tree(), marks.touched, marks.marks, self._path
         )
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mapping.grids.evidence import FREE, OCCUPIED, PARTLY_FREE, UNKNOWN
 from mapping.grids.octree import HALF, HEADER, Octree, VoxelRules
+from mapping.kernels import octree_ends as ends
 from mapping.kernels import octree_rays as rays
 
 F64 = NDArray[np.float64]
@@ -497,7 +498,7 @@ def test_few_rays_of_a_depth_image_are_walked(monkeypatch: pytest.MonkeyPatch) -
 
     def noted(*arguments: Any) -> int:
         done = int(mark_ways(*arguments))
-        walked.append(int(arguments[-5][rays.WALKED]))
+        walked.append(int(arguments[-5][ends.WALKED]))
         return done
 
     monkeypatch.setattr(rays, "mark_ways", noted)
