@@ -82,6 +82,7 @@ class BoxCount:
 
 
 _LEAST: Final = 5  # rays that end in one voxel: fewer are walked one by one
+_MANY: Final = 64  # fewer are quickly asked for their slopes
 
 
 class _Marks:
@@ -177,28 +178,29 @@ class Octree:
 
     def _insert_rays(self, origin: F64, points: F64, range_max_m: float, hit: NDArray[np.bool_]) -> None:
         n = len(points)
-        cloud = (origin, points, self.resolution_m, range_max_m, hit)
         marks, refused = _Marks(self._touched_before), np.zeros(n, dtype=np.uint8)
-        runs, groups = np.empty((n, 3), dtype=np.int32), np.empty(n, dtype=np.int64)
-        members, fans = np.empty((n, 2), dtype=np.int32), np.empty((n, 4), dtype=np.float32)
-        grouped = (runs, groups, members, fans)
-        table = np.full(1 << (2 * n - 1).bit_length(), -1, dtype=np.int32)
+        names, starts = np.empty(n, dtype=np.int64), np.empty(n + 1, dtype=np.int32)
+        runs = ends.name_ends(origin, points, self.resolution_m, range_max_m, hit, names, starts)
+        before, groups = np.empty(runs, dtype=np.int32), np.empty((runs, ends.GROUP), dtype=np.int64)
+        table = np.full(1 << (2 * runs - 1).bit_length(), -1, dtype=np.int32)
         count = np.zeros(ends.COUNT_LENGTH, dtype=np.int64)
         some, slope = np.empty(n, dtype=np.int32), np.empty((n, 2))
         keep = self._lowest - kernels.UNIFORM
+        many = _MANY if 4 * runs < 3 * n else 0  # where neighbours end apart, a group's rays lie apart in memory
 
         done, full = 0, False
-        while done < n:
+        while done < runs:
             done = ends.mark_ends(
-                done, full, *cloud, *self._tree(), *marks.arrays(), *grouped, table, count, self._path, refused
+                done, full, runs, names, starts, before, groups, table, count, *self._tree(), *marks.arrays(),
+                self._path, refused,
             )  # fmt: skip
-            full = done < n and not self._grow(marks)
+            full = done < runs and not self._grow(marks)
         for first_only in (True, False):
             done, full = 0, False
             while done < count[ends.GROUPS]:
                 done = rays.mark_ways(
-                    done, full, first_only, _LEAST, *cloud, keep, *self._tree(), *marks.arrays(), *grouped, count,
-                    some, slope, self._path, refused,
+                    done, full, first_only, _LEAST, many, origin, points, self.resolution_m, range_max_m, keep, starts,
+                    before, groups, count, some, slope, *self._tree(), *marks.arrays(), self._path, refused,
                 )  # fmt: skip
                 full = done < count[ends.GROUPS] and not self._grow(marks)
         self.rejected_points += int(count[ends.SAID_NOTHING])
