@@ -174,6 +174,15 @@ def test_long_rays_are_cut_and_rays_without_an_echo_put_no_obstacle() -> None:
     assert octree.state_at(at).tolist() == [FREE, UNKNOWN, UNKNOWN, FREE, UNKNOWN]
 
 
+def test_whether_one_ray_met_something_says_nothing_of_the_others() -> None:
+    ends = [(1.55, 0.05, 0.05), (0.05, 1.55, 0.05), (0.05, 0.05, 1.55), (0.05, 1.55, 0.05)]
+    for echo in ([False, True, False, False], [True, False, True, False]):
+        octree = Octree(resolution_m=D)
+        octree.insert((0.05, 0.05, 0.05), ends, is_hit=echo)
+        met = [echo[0], echo[1] or echo[3], echo[2]]
+        assert octree.state_at(ends[:3]).tolist() == [OCCUPIED if one else UNKNOWN for one in met]
+
+
 def test_points_that_say_nothing_are_counted_and_change_nothing() -> None:
     octree = Octree(resolution_m=D)
     octree.insert((0.0, 0.0, 0.0), [(np.nan, 0, 0), (np.inf, 0, 0), (0, 1e300, 0), (0, 0, -HALF * D - 1.0)])
