@@ -1,4 +1,4 @@
-"""Compiled loops of the octree (S32): look-ups, sums of two trees, pruning, bytes; rays: mapping.kernels.octree_rays.
+"""Compiled loops of the octree (S32): look-ups, sums of two trees, pruning, bytes; rays: octree_ends, octree_rays.
 
 The tree ends in bricks of 8 x 8 x 8 voxels, so that a ray walks arrays and goes through the tree only from brick to
 brick, and there from the deepest node that the two have in common. LEVELS levels of nodes stand above the bricks:
