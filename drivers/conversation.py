@@ -40,13 +40,13 @@ class SetBaudRate:
 
 WireT = TypeVar("WireT", bytes, CanFrame)
 
-LEAST_SILENCE_NS = 60_000_000
-"""Shorter pauses are those of USB hubs, adapters and schedulers (tens of milliseconds), not of devices."""
+LEAST_SILENCE_NS = 30_000_000
+"""Shorter pauses are those of USB chips (16 ms) and schedulers, not of devices."""
 MOST_SILENCE_NS = 500_000_000
 
 
 def silence_limit(period_ns: int) -> int:
-    """When a device with this period counts as silent: after three periods, at least 60 ms, at most 500 ms."""
+    """When a device with this period counts as silent: after three periods, at least 30 ms, at most 500 ms."""
     return min(max(3 * period_ns, LEAST_SILENCE_NS), MOST_SILENCE_NS)
 
 
@@ -75,8 +75,8 @@ class Conversation(Protocol[WireT]):
 
     @property
     def silence_limit_ns(self) -> int:
-        """No reading for longer than this means that the device is silent: see silence_limit. The reader allows three
-        of the periods that it measures, if those are longer."""
+        """No reading for longer than this means that the device is silent: see silence_limit. The reader allows more
+        where it measures longer periods, or that readings are held back."""
 
     def connected(self, now_ns: int) -> None:
         """The wire was opened or reopened: forget partial messages, begin with reset and resynchronisation."""

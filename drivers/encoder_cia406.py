@@ -44,14 +44,14 @@ _FULL_RANGE = 1 << 32
 _TELLS_FULL_RANGE = (0, _FULL_RANGE - 1)  # 6002h has 32 bits, in which 2^32 cannot be said
 
 _HEARTBEAT_MS = 100
-# Missing readings are noticed after 60 ms or three periods. A node is given up, and with it the run of its count, only
+# Missing readings are noticed after three periods. A node is given up, and with it the run of its count, only
 # after five heartbeats: until then it may have been the bus or this machine that paused.
 _LIFE_NS = 5 * _HEARTBEAT_MS * 1_000_000
 _SEARCH_PERIOD_NS = 250_000_000
 _REFUSED_RETRY_NS = 1_000_000_000
 _START_REPEAT_NS = 300_000_000
 _SYNC_PATIENCE_NS = 1_000_000_000  # started, alive, but no TPDO2 for so long: this node does not know SYNC
-_SHORTEST_ANSWER_LIMIT_NS = 40_000_000  # so that one lost answer is no silence yet
+_SHORTEST_ANSWER_LIMIT_NS = 40_000_000  # later ones would be taken for answers to the next SYNC
 _UNKNOWN_STEPS = 65536
 _JUMP_FACTOR = 10.0  # a count that moved ten times as far as the fastest wheel was set anew
 _NEVER = 1 << 62

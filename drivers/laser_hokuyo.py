@@ -242,10 +242,10 @@ class HokuyoConversation:
         self._deadline_ns = now_ns + step.wait_ns
 
     def _notice_silence(self, now_ns: int) -> None:
-        """Say that scans have stopped; and after a stall of our own, give waiting bytes time to be read first."""
+        """Say that scans have stopped, long after the reader did; after a stall, read first what waits."""
         if now_ns - self._asked_ns > STALL_NS and now_ns - self._received_ns > STALL_NS:
             self._deadline_ns = max(self._deadline_ns, now_ns + STALL_NS // 3)
-        elif self._state is LinkState.RUNNING and now_ns - self._last_scan_ns > self.silence_limit_ns:
+        elif self._state is LinkState.RUNNING and now_ns - self._last_scan_ns > max(self.silence_limit_ns, RESTART_NS):
             self._state = LinkState.SILENT
             self._trouble = "scans have stopped: check the cable and the power supply; the driver keeps asking"
         self._asked_ns = now_ns

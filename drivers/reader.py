@@ -4,7 +4,8 @@ One thread per wire; several conversations may share a CAN wire, each then sees 
 
     port cannot be opened or is lost   ABSENT at once; tried again after 0.1 s, later up to 1 s, for ever
     no reading within silence_limit    SILENT at once, while it goes on asking; after 0.4 s more (0.6 s in all, at
-       (three of its usual periods)    least) it starts from reset, then again after up to 1 s each
+       (three of its usual periods)    least) it starts from reset, then again after up to 1 s each; only time counts
+                                       in which this thread was there to listen, see _hear_out
     set-up takes for ever              the conversation starts from reset after 20 s
     an exception in a conversation     a bug: logged with its traceback, counted, that conversation alone restarts
 
@@ -39,7 +40,11 @@ _SILENCE_OF_STRANGERS_NS = 200_000_000  # until a source's usual period is known
 _MUCH_LONGER = 1.5  # less is the jitter of its deliveries
 _INTERVALS_KEPT = 9  # three quarters of so many are no longer than a source's usual period
 _CHECK_PERIOD_NS = 10_000_000  # silence and words are looked at so often; a change of state at once
-_OWN_PAUSE_NS = 30_000_000  # so much later than it should be, the loop itself was held up
+_HELD_UP_NS = 5_000_000  # a turn that took so much longer than it should was held up: by the system, or other threads
+_HOLD_UPS_NS = 60_000_000  # longer than hubs, adapters and schedulers hold readings back: surely silence
+_HOLD_UP_MARGIN = 1.5
+_HOLD_UPS_KEPT_NS = 10_000_000_000  # and for as long again
+_READINGS_TO_KNOW = 50
 _SETUP_LIMIT_NS = 20_000_000_000  # spin-up and the search for a line speed included
 _EVENT_PERIOD_NS = 1_000_000_000  # between two events that tell the same state in other words
 _LOG_PERIOD_NS = 60_000_000_000
@@ -181,7 +186,10 @@ class WireReader(Generic[WireT]):
             return
         port = self._port
         try:
-            items = port.read(self._wait_s(self._clock()))
+            wait_s = self._wait_s(self._clock())
+            asked_ns = self._clock()
+            items = port.read(wait_s)
+            heard_out_ns = items[-1][1] if items else min(self._clock(), asked_ns + round(wait_s * 1e9))
             with self._lock:
                 self._hand_on(items)
                 now_ns = self._clock()
@@ -190,9 +198,7 @@ class WireReader(Generic[WireT]):
                 for source in self._sources:
                     self._send(port, source.requests(now_ns), now_ns)
                 self._send_posted(port)
-                self._forgive_own_pause()
-                for source in self._sources:
-                    source.check(now_ns)
+                self._hear_out(now_ns, heard_out_ns, round(wait_s * 1e9))
                 if self._start_anew.is_set():
                     self._start_anew.clear()
                     for source in self._sources:
@@ -241,7 +247,7 @@ class WireReader(Generic[WireT]):
     def _wait_s(self, now_ns: int) -> float:
         due_ns = now_ns + POLL_PERIOD_NS
         for source in self._sources:
-            due_ns = min(due_ns, source.next_request_ns(due_ns))
+            due_ns = min(due_ns, source.next_request_ns(due_ns), source.silent_from_ns(due_ns))
         return max((due_ns - now_ns) / 1e9, _SHORTEST_WAIT_S)
 
     def _hand_on(self, items: list[tuple[WireT, int]]) -> None:
@@ -254,14 +260,20 @@ class WireReader(Generic[WireT]):
         if items:
             self._backoff.reset()
 
-    def _forgive_own_pause(self) -> None:
-        """Time in which this thread did not run, and so could not ask, is no device's silence."""
-        now_ns = self._clock()
-        pause_ns = now_ns - self._turned_ns - POLL_PERIOD_NS
-        self._turned_ns = now_ns
-        if pause_ns > _OWN_PAUSE_NS:
-            for source in self._sources:
-                source.forgive(pause_ns)
+    def _hear_out(self, now_ns: int, heard_out_ns: int, wait_ns: int) -> None:
+        """Silence, as far as it was surely heard: whatever came until heard_out_ns was read in this turn.
+
+        wait_ns: how long the turn meant to take. What it took beyond, this thread was held up: it neither listened nor
+        asked, and so that is no device's silence.
+        """
+        done_ns = self._clock()
+        late_ns = done_ns - self._turned_ns - wait_ns
+        held_up_ns = late_ns if late_ns > _HELD_UP_NS else 0
+        for source in self._sources:
+            source.check(now_ns, min(heard_out_ns, done_ns - held_up_ns))
+            if held_up_ns:
+                source.forgive(held_up_ns, done_ns)
+        self._turned_ns = done_ns
 
     def _send(self, port: Port[WireT], items: Iterable[WireT | SetBaudRate], now_ns: int) -> None:
         for item in items:
@@ -336,6 +348,8 @@ class _Source(Generic[WireT]):
         self._last_reading_ns: int | None = None
         self._rate = _Rate()
         self._usual = _UsualPeriod()
+        self._hold_ups = _HoldUps()
+        self._limit_ns = MOST_SILENCE_NS  # as last looked at
 
     # ---- what the loop tells
 
@@ -346,9 +360,10 @@ class _Source(Generic[WireT]):
         self._restart(now_ns)
         self._tell_safely(now_ns)
 
-    def forgive(self, pause_ns: int) -> None:
-        self._alive_ns += pause_ns
-        self._setup_ns += pause_ns
+    def forgive(self, held_up_ns: int, now_ns: int) -> None:
+        """The reader was held up for so long in the turn that ends now."""
+        self._alive_ns = min(self._alive_ns + held_up_ns, max(now_ns, self._alive_ns))
+        self._setup_ns = min(self._setup_ns + held_up_ns, max(now_ns, self._setup_ns))
 
     def lost(self, now_ns: int, why: str) -> None:
         self._wire_trouble = why
@@ -392,7 +407,13 @@ class _Source(Generic[WireT]):
             return latest_ns  # requests() will meet the same trouble and report it
         return latest_ns if due_ns is None else due_ns
 
-    def check(self, now_ns: int) -> None:
+    def silent_from_ns(self, latest_ns: int) -> int:
+        """When it will be silent if nothing comes; latest_ns if it is, or if it does not run."""
+        if self._seen_state is not LinkState.RUNNING or self._loop_trouble or self._broken_until_ns is not None:
+            return latest_ns
+        return self._alive_ns + self._limit_ns
+
+    def check(self, now_ns: int, heard_out_ns: int) -> None:
         """Notice silence, set-up that does not end, and changes worth telling."""
         if self._broken_until_ns is not None:
             if now_ns >= self._broken_until_ns:
@@ -401,10 +422,11 @@ class _Source(Generic[WireT]):
                 self._restart(now_ns)
             return
         try:
-            if self._conversation.state is self._seen_state and now_ns < self._checked_ns + _CHECK_PERIOD_NS:
+            is_due = now_ns >= self._checked_ns + _CHECK_PERIOD_NS or heard_out_ns >= self.silent_from_ns(now_ns + 1)
+            if self._conversation.state is self._seen_state and not is_due:
                 return
             self._checked_ns = now_ns
-            self._supervise(now_ns)
+            self._supervise(now_ns, heard_out_ns)
             self._tell(now_ns)
         except Exception as error:
             self._note_bug(now_ns, error)
@@ -430,7 +452,7 @@ class _Source(Generic[WireT]):
 
     # ---- how it works
 
-    def _supervise(self, now_ns: int) -> None:
+    def _supervise(self, now_ns: int, heard_out_ns: int) -> None:
         state = self._conversation.state
         if state is not self._seen_state:
             self._seen_state = state
@@ -439,9 +461,9 @@ class _Source(Generic[WireT]):
                 self._loop_trouble = None  # it answers again
             if state is LinkState.RUNNING:
                 self._alive_ns = max(self._alive_ns, now_ns)
-        limit_ns = self._silence_limit_ns()
+        limit_ns = self._limit_ns = self._silence_limit_ns()
         if state is LinkState.RUNNING:
-            silence_ns = now_ns - self._alive_ns
+            silence_ns = heard_out_ns - self._alive_ns
             if silence_ns >= limit_ns:
                 self._loop_trouble = f"no reading for {silence_ns / 1e9:.2f} s: check its power and cable"
                 if silence_ns >= max(limit_ns + _SILENCE_PATIENCE_NS, _SHORTEST_BEFORE_RESET_NS):
@@ -452,10 +474,15 @@ class _Source(Generic[WireT]):
             self._restart(now_ns)
 
     def _silence_limit_ns(self) -> int:
-        """What the conversation says, or three of the periods that were measured where the device takes much longer."""
+        """What the conversation says; more where the device takes longer, or is held back on its way.
+
+        That is three of the periods that were measured, if those are much longer, and half as much again as readings
+        were lately held back, up to 60 ms.
+        """
         told_ns = self._conversation.silence_limit_ns
         if self._usual.period_ns == 0:
             return max(told_ns, _SILENCE_OF_STRANGERS_NS)
+        told_ns = max(told_ns, self._hold_ups.limit_ns)
         found_ns = min(3 * self._usual.period_ns, MOST_SILENCE_NS)
         return found_ns if found_ns > _MUCH_LONGER * told_ns else told_ns
 
@@ -482,6 +509,8 @@ class _Source(Generic[WireT]):
 
     def _note_reading(self, stamp_ns: int) -> None:
         self._readings += 1
+        if self._last_reading_ns is not None:
+            self._hold_ups.count(stamp_ns, stamp_ns - self._alive_ns)
         self._alive_ns = stamp_ns
         self._last_reading_ns = stamp_ns
         self._loop_trouble = None
@@ -619,6 +648,32 @@ class _UsualPeriod:
             if len(self._intervals) == _INTERVALS_KEPT:
                 self.period_ns = sorted(self._intervals)[_INTERVALS_KEPT * 3 // 4]
         self._last_ns = stamp_ns
+
+
+class _HoldUps:
+    """How long readings were lately held back on their way: by a hub, an adapter, a scheduler that had other work.
+
+    limit_ns: below it a wait is nothing new; 60 ms until enough readings came. Longer waits were silence and teach
+    nothing. Only sources with periods below 20 ms have limits so short. It is the largest wait of the last 10 to 20 s.
+    """
+
+    def __init__(self) -> None:
+        self.limit_ns = _HOLD_UPS_NS
+        self._began_ns = 0
+        self._count = 0
+        self._past_ns = 0
+        self._most_ns = 0
+
+    def count(self, stamp_ns: int, wait_ns: int) -> None:
+        if wait_ns > _HOLD_UPS_NS:
+            return
+        self._count += 1
+        self._most_ns = max(self._most_ns, wait_ns)
+        if self._count < _READINGS_TO_KNOW:
+            return
+        if stamp_ns - self._began_ns > _HOLD_UPS_KEPT_NS:
+            self._began_ns, self._past_ns, self._most_ns = stamp_ns, self._most_ns, wait_ns
+        self.limit_ns = min(round(_HOLD_UP_MARGIN * max(self._past_ns, self._most_ns)), _HOLD_UPS_NS)
 
 
 class _RateLimitedLog:
