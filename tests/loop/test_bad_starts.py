@@ -12,11 +12,9 @@ import socket
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,16 +24,11 @@ from sim_devices.attach import Attachment, PtyLink
 from sim_devices.device import F64, ByteDevice, Mount
 from sim_devices.laser_hokuyo import UTM_30LX, HokuyoLaser
 from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardSerial
+from tests.waiting import GIVE_UP_S, START_S, free_port, wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 # Root may open anything, unless it has laid down this right.
 AS_MERE_OWNER = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-all"]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Place:
@@ -61,7 +54,7 @@ class Place:
             cwd=ROOT,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=START_S,
             check=False,
         )
 
@@ -75,7 +68,7 @@ class Place:
             self.command("run"), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
         try:
-            wait_for("the daemon", lambda: process.poll() is not None or is_listening(self.endpoint_port), 30.0)
+            wait_for("the daemon", lambda: process.poll() is not None or is_listening(self.endpoint_port), START_S)
             assert process.poll() is None
             yield process
         finally:
@@ -86,13 +79,6 @@ class Place:
 def is_listening(port: int) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def wait_for(what: str, ready: Callable[[], Any], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not ready():
-        assert time.monotonic() < deadline, f"{what}: not within {seconds} s"
-        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -250,7 +236,7 @@ def test_a_second_daemon_on_the_port_goes_and_the_first_stays(place: Place, tmp_
         sent = link.counters.sent_bytes
         wait_for("more scans for the first", lambda: link.counters.sent_bytes > sent + 50_000)
         first.send_signal(signal.SIGTERM)
-        said, _ = first.communicate(timeout=15)
+        said, _ = first.communicate(timeout=GIVE_UP_S)
         assert first.returncode == 0, said
     with MapStore.open(place.store, wall_ns=lambda: 0, read_only=True) as store:
         assert store.info()
@@ -287,7 +273,7 @@ def test_a_map_that_another_program_writes(place: Place) -> None:
 def test_a_map_that_is_locked_by_a_database_browser(place: Place) -> None:
     with place.daemon() as first:
         first.send_signal(signal.SIGTERM)
-        first.communicate(timeout=15)
+        first.communicate(timeout=GIVE_UP_S)
     before = place.store.read_bytes()
     browser = sqlite3.connect(place.store)
     try:
@@ -318,13 +304,13 @@ def test_a_torn_map_is_put_aside_and_told(place: Place) -> None:
     """Half of a map's pages are gone: the daemon says so at its start, keeps the broken file, and runs."""
     with place.daemon() as first:
         first.send_signal(signal.SIGTERM)
-        first.communicate(timeout=15)
+        first.communicate(timeout=GIVE_UP_S)
     whole = place.store.read_bytes()
     torn = whole[:4096] + b"\xa5" * (len(whole) - 4096)
     place.store.write_bytes(torn)
     with place.daemon() as second:
         second.send_signal(signal.SIGTERM)
-        said, _ = second.communicate(timeout=15)
+        said, _ = second.communicate(timeout=GIVE_UP_S)
         assert second.returncode == 0, said
     (told,) = (line for line in said.splitlines() if "ERROR" in line)
     assert f"{place.store} was damaged" in told

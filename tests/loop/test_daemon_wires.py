@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,15 +16,12 @@ import pytest
 
 from service.store import MapStore, occupancy_patch
 from service.zenoh_session import Client
+from tests.clients import connected, document
+from tests.waiting import GIVE_UP_S, START_S, free_port, wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 ROBOT = "robots/artos"
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+SECOND = 1_000_000_000
 
 
 @dataclass
@@ -59,18 +55,10 @@ class Robot:
     def stop(self, process: subprocess.Popen[bytes], number: int = signal.SIGTERM) -> int:
         process.send_signal(number)
         self.processes.remove(process)
-        return process.wait(15)
+        return process.wait(GIVE_UP_S)
 
     def log(self) -> str:
         return (self.folder / "run.log").read_text()
-
-
-def wait_for(what: str, ready: Callable[[], Any], seconds: float = 30.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (result := ready()):
-        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
-        time.sleep(0.02)
-    return result
 
 
 @pytest.fixture
@@ -89,24 +77,8 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
             process.wait()
 
 
-def connect(robot: Robot) -> Client:
-    def attempt() -> Client | None:
-        try:
-            client = Client(robot.endpoint)
-        except Exception:
-            return None
-        if client.bases() == [ROBOT]:
-            return client
-        client.close()
-        return None
-
-    client: Client = wait_for("the daemon", attempt)
-    return client
-
-
 def value(client: Client, key: str) -> Any:
-    found = client.get(f"{ROBOT}/{key}")
-    return json.loads(found[0].payload) if found else None
+    return document(client, f"{ROBOT}/{key}")
 
 
 def states(client: Client, name: str) -> set[str]:
@@ -119,25 +91,52 @@ def device(client: Client, name: str) -> Any:
     return next((each for each in health["sources"] if each["name"] == name), None) if health else None
 
 
+def stamp_ns(told: Any) -> int:
+    """Wall time."""
+    return int(told["stamp"]["sec"]) * SECOND + int(told["stamp"]["nanosec"])
+
+
+def told_until(subscriber: Any, until_ns: int) -> Iterator[Any]:
+    """Documents as they come, up to one with a stamp of that time."""
+    newest_ns = 0
+    while newest_ns < until_ns:
+        told = json.loads(bytes(wait_for("a document", subscriber.try_recv).payload))
+        newest_ns = stamp_ns(told)
+        yield told
+
+
 def test_a_robot_maps_loses_its_devices_gets_them_back_and_keeps_its_map(robot: Robot) -> None:
     sim = robot.start_devices()
     daemon = robot.start_daemon()
-    with connect(robot) as client:
+    with connected(robot.endpoint, ROBOT) as client:
         wait_for("sight", lambda: "obstacle" in states(client, "laser"))
         wait_for("sonars", lambda: states(client, "sonar_left") - {"unknown", "stale"})
-        wait_for("a grid", lambda: client.get(f"{ROBOT}/map/grid"))
-        wait_for("health", lambda: (value(client, "health/json") or {}).get("level") == "ok")
-        assert {each["name"] for each in value(client, "health/json")["sources"]} == {"front", "left", "right", "drive"}
+        wait_for("a map", lambda: client.call(ROBOT, "map_info")["occupied_cells"] > 200)
 
-        # The cables are pulled: every sector that was fed is stale within half a second, none is freer than before.
+        def healthy() -> Any:
+            health = value(client, "health/json")
+            return health if health and health["level"] == "ok" else None
+
+        health = wait_for("health", healthy)
+        assert {each["name"] for each in health["sources"]} == {"front", "left", "right", "drive"}
+
+        # The cables are pulled: every sector that was fed is stale within half a second, by the stamps of the maps.
+        names = ("laser", "sonar_left")
+        heard = {name: client.subscribe(f"{ROBOT}/sectors/polar/{name}", ring=4096) for name in names}
         robot.stop(sim, signal.SIGKILL)
-        pulled = time.monotonic()
-        wait_for("staleness", lambda: states(client, "laser") <= {"stale", "unknown"}, 5.0)
-        wait_for("staleness", lambda: states(client, "sonar_left") <= {"stale", "unknown"}, 5.0)
-        assert time.monotonic() - pulled < 1.5  # half a second, and what asking takes on a busy machine
-        lost = wait_for("the report", lambda: each if (each := device(client, "front"))["level"] != "ok" else None)
-        assert lost["state"] in ("absent", "silent")
-        assert "/laser-front" in lost["text"] or "cable" in lost["text"]
+        pulled_ns = time.time_ns()
+        for name in names:
+            for told in told_until(heard[name], pulled_ns + 2 * SECOND):
+                fresh = {each["state"] for each in told["sectors"]} - {"stale", "unknown"}
+                assert not fresh or stamp_ns(told) <= pulled_ns + SECOND // 2, (name, fresh)
+
+        def lost() -> Any:
+            front = device(client, "front")
+            return front if front and front["level"] != "ok" else None
+
+        report = wait_for("the report", lost)
+        assert report["state"] in ("absent", "silent")
+        assert "/laser-front" in report["text"] or "cable" in report["text"]
 
         # They are plugged in again: all by itself it goes on.
         robot.start_devices()
@@ -155,7 +154,7 @@ def test_a_robot_maps_loses_its_devices_gets_them_back_and_keeps_its_map(robot: 
 
     # A new start has the old map from its first grid on.
     daemon = robot.start_daemon()
-    with connect(robot) as client:
+    with connected(robot.endpoint, ROBOT) as client:
         document = wait_for(
             "the restored grid", lambda: [each.payload for each in client.get(f"{ROBOT}/map/grid?format=json")]
         )
@@ -170,7 +169,7 @@ def test_without_devices_it_waits_and_says_so_and_a_second_daemon_is_refused(rob
         f'[robot]\nid = "artos"\n[lasers.front]\ndriver = "hokuyo"\nport = "{robot.folder}/laser-front"\n'
     )
     daemon = robot.start_daemon()
-    with connect(robot) as client:
+    with connected(robot.endpoint, ROBOT) as client:
         absent = wait_for("a report", lambda: device(client, "front"))
         assert absent["state"] == "absent"
         assert "plugged in" in absent["text"]
@@ -184,7 +183,7 @@ def test_without_devices_it_waits_and_says_so_and_a_second_daemon_is_refused(rob
             cwd=ROOT,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=START_S,
             check=False,
         )
         assert second.returncode == 1

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from sim_devices.attach import Attachment, PtyLink
 from sim_devices.device import Mount
 from sim_devices.laser_hokuyo import HokuyoLaser
 from sim_devices.laser_rplidar import RpLidar
+from tests.waiting import GIVE_UP_S, wait_for
 
 F64 = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[2]
@@ -71,14 +72,6 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
     made.attachment.stop()
 
 
-def wait_for(what: str, ready: Callable[[], Any], seconds: float = 20.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (result := ready()):
-        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
-        time.sleep(0.02)
-    return result
-
-
 def crashed(robot: Robot) -> None:
     """Bring the lasers up, then drop the lines without a word, as a killed daemon does."""
     wires = assemble.wires(load(robot.config).config)
@@ -112,12 +105,12 @@ def test_after_a_crash_stop_leaves_every_laser_dark(robot: Robot) -> None:
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=GIVE_UP_S,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert [each["name"] for each in json.loads(done.stdout)] == ["front", "rear"]
-    wait_for("darkness", lambda: not robot.front.laser_is_on and not robot.rear.is_scanning, 3.0)
+    wait_for("darkness", lambda: not robot.front.laser_is_on and not robot.rear.is_scanning)
 
 
 def test_devices_of_a_running_daemon_are_left_to_it_and_absent_ones_are_told(robot: Robot, tmp_path: Path) -> None:
@@ -157,10 +150,10 @@ def test_a_covered_sensor_tells_its_name_and_port(robot: Robot, tmp_path: Path) 
             said.append(process.stderr.readline())
             assert said[-1], "".join(said)
         robot.rooms["rear"].radius_m = 0.16
-        out, _ = process.communicate(timeout=30)
+        out, _ = process.communicate(timeout=GIVE_UP_S)
     finally:
         if process.poll() is None:
             process.send_signal(signal.SIGKILL)
     assert out.split() == ["rear", "on", f"{tmp_path}/rear"]
     assert any("heard: front, rear" in line for line in said)
-    wait_for("darkness", lambda: not robot.front.laser_is_on and not robot.rear.is_scanning, 3.0)
+    wait_for("darkness", lambda: not robot.front.laser_is_on and not robot.rear.is_scanning)

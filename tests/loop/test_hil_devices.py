@@ -37,6 +37,7 @@ from sim_devices.faults import Fault, FaultPlan
 from sim_devices.laser_hokuyo import PROFILES
 from sim_devices.presets import HOST, Table, emulate, preset, to_toml
 from sim_devices.slcan_hub import CanBus, CanBusStation
+from tests.waiting import GIVE_UP_S, SteadyClock, wait_for
 
 SECOND = 1_000_000_000
 SEEN_NS = SECOND // 2
@@ -117,7 +118,9 @@ class Rig:
         self.bridges: list[SerialBridge | CanBridge] = []
         self.links: list[Link] = []
         self.plan = FaultPlan(seed=7)
-        self.attachment = Attachment()
+        self._steady = None if self.is_real else SteadyClock()
+        self.clock: Callable[[], int] = self._steady or time.monotonic_ns
+        self.attachment = Attachment(clock=self.clock)
         table = self._attach(config_for(self.kind, self.hardware.get(self.kind)))
         path = self.folder / "umfeld.toml"
         path.write_text(to_toml(table))
@@ -128,13 +131,13 @@ class Rig:
         fusion = Fusion(assemble.parts(self.config, self.sensors, made, OdometryOnly()))
         self.worker = Worker(
             fusion,
-            lambda output: self.told.append((time.monotonic_ns(), output)),
-            now_ns=time.monotonic_ns,
+            lambda output: self.told.append((self.clock(), output)),
+            now_ns=self.clock,
             beat=lambda now_ns: None,
             health=lambda now_ns: HealthOut(now_ns, 0, "", (), {}, {}),
         )
         (wire,) = assemble.wires(self.config)
-        self.reader: WireReader[Any] = wire.reader(self._sink, time.monotonic_ns)
+        self.reader: WireReader[Any] = wire.reader(self._sink, self.clock)
 
     def _attach(self, table: Table) -> Table:
         if not self.is_real:
@@ -174,9 +177,11 @@ class Rig:
         return self
 
     def __exit__(self, *_: object) -> None:
-        assert self.reader.stop(3.0)
-        assert self.worker.stop(3.0)
+        assert self.reader.stop(GIVE_UP_S)
+        assert self.worker.stop(GIVE_UP_S)
         self.attachment.stop()
+        if self._steady is not None:
+            self._steady.stop()
         for bridge in self.bridges:
             bridge.close()
         assert self.worker.errors == 0
@@ -210,20 +215,19 @@ class Rig:
             self.readings(name, since_ns) for name in self.sensors
         )
 
-    def next_readings(self, source: str, count: int, since_ns: int, *, within_s: float = 10.0) -> list[Any]:
+    def next_readings(self, source: str, count: int, since_ns: int) -> list[Any]:
         """Readings of a source once there are so many."""
-        wait_for(f"{count} readings of {source}", lambda: len(self.readings(source, since_ns)) >= count, within_s)
+        wait_for(f"{count} readings of {source}", lambda: len(self.readings(source, since_ns)) >= count)
         return self.readings(source, since_ns)
 
-    def next_event(self, source: str, since_ns: int, *, running: bool, within_s: float = 10.0) -> DeviceEvent:
+    def next_event(self, source: str, since_ns: int, *, running: bool) -> DeviceEvent:
         """The first news that a source is running, or is not."""
 
         def found() -> DeviceEvent | None:
             events = self.events(source, since_ns)
             return next((each for each in events if (each.state is LinkState.RUNNING) == running), None)
 
-        event: DeviceEvent = wait_for(f"{source} {'back' if running else 'missed'}", found, within_s)
-        return event
+        return wait_for(f"{source} {'back' if running else 'missed'}", found)
 
     def overrun_bytes(self) -> int:
         """What ptys had no room for, because this machine let the reader wait: lost, and no fault of the driver."""
@@ -234,8 +238,8 @@ class Rig:
     def in_loop(self, work: Callable[[int], Any]) -> tuple[Any, int]:
         """Run something between two steps of the emulators; its result, and when that was."""
         done: list[tuple[Any, int]] = []
-        self.attachment.post(lambda: done.append((work(time.monotonic_ns()), time.monotonic_ns())))
-        wait_for("the emulators", lambda: done, 5.0)
+        self.attachment.post(lambda: done.append((work(self.clock()), self.clock())))
+        wait_for("the emulators", lambda: done)
         return done[0]
 
     def begin(self, fault: str) -> tuple[Fault, int]:
@@ -287,19 +291,11 @@ def _put_on(table: Table, kind: str, hardware: str) -> None:
         table["wheels"]["drive"]["node_left"], table["wheels"]["drive"]["node_right"] = numbers
 
 
-def wait_for(what: str, ready: Callable[[], Any], seconds: float = 10.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (result := ready()):
-        assert time.monotonic() < deadline, f"{what}: not within {seconds} s"
-        time.sleep(0.005)
-    return result
-
-
 @pytest.fixture
 def rig(device: str, tmp_path: Path, hardware: dict[str, str], request: pytest.FixtureRequest) -> Iterator[Rig]:
     mark = request.node.get_closest_marker("hil")
     with Rig(tmp_path, device, hardware, between=bool(mark and mark.kwargs.get("between"))) as rig:
-        wait_for("the device", rig.is_running, 25.0 if rig.is_real else 10.0)
+        wait_for("the device", rig.is_running)
         yield rig
 
 
@@ -316,7 +312,7 @@ def assert_true(rig: Rig, readings: Sequence[Any]) -> None:
         case WheelReading():
             assert_counts(rig, readings)
     stamps = [reading.stamp_ns for reading in readings]
-    assert max(stamps) <= time.monotonic_ns()
+    assert max(stamps) <= rig.clock()
     if not isinstance(readings[0], ChainReading):  # groups of a chain fire together
         assert all(a < b for a, b in itertools.pairwise(stamps))
 
@@ -394,7 +390,7 @@ DAMAGE = {
 @pytest.mark.hil
 @pytest.mark.parametrize("device", DEVICES)
 def test_whole_bytes_are_the_truth(rig: Rig) -> None:
-    begin_ns, damaged = time.monotonic_ns(), damage(rig)
+    begin_ns, damaged = rig.clock(), damage(rig)
     for source in rig.sensors:
         readings = rig.next_readings(source, 2 * enough(rig), begin_ns)
         assert_true(rig, readings)
@@ -414,7 +410,7 @@ def test_whole_bytes_are_the_truth(rig: Rig) -> None:
 def test_bytes_in_pieces_are_the_same_readings(rig: Rig, split: str) -> None:
     damaged = damage(rig)
     rig.begin(f"{WIRE[rig.kind]}:{split}")
-    begin_ns = time.monotonic_ns()
+    begin_ns = rig.clock()
     for source in rig.sensors:
         readings = rig.next_readings(source, enough(rig), begin_ns)
         if rig.kind == "laser":  # how late a piece comes shows in the stamps of devices without a clock
@@ -432,15 +428,15 @@ def test_noise_and_loss_are_counted_and_never_believed(rig: Rig, harm: str) -> N
         assert_true(rig, rig.next_readings(source, 1, begin_ns))
     ended_ns = rig.end(fault)
     for source in rig.sensors:
-        readings = rig.next_readings(source, enough(rig), ended_ns, within_s=4.0)
+        readings = rig.next_readings(source, enough(rig), ended_ns)
         assert_true(rig, readings)
-    wait_for("silence of the counters", lambda: is_calm(rig), 4.0)
+    wait_for("silence of the counters", lambda: is_calm(rig))
 
 
 def is_calm(rig: Rig) -> bool:
     """Whether nothing is damaged over some readings."""
     damaged, count = damage(rig), sum(health.readings for health in rig.health().values())
-    wait_for("readings", lambda: sum(health.readings for health in rig.health().values()) >= count + 6, 4.0)
+    wait_for("readings", lambda: sum(health.readings for health in rig.health().values()) >= count + 6)
     return damage(rig) == damaged
 
 
@@ -466,7 +462,7 @@ PLUGS = [
 @pytest.mark.parametrize(("device", "fault", "lost", "start_s"), PLUGS, ids=[f"{p[0]} {p[1]}" for p in PLUGS])
 def test_a_lost_device_is_seen_goes_stale_and_comes_back(rig: Rig, fault: str, lost: list[str], start_s: float) -> None:
     wait_for("sectors", lambda: rig.kind == "wheels" or len(rig.polar()) >= 4)
-    settled_ns = time.monotonic_ns()
+    settled_ns = rig.clock()
     wait_for("sectors", lambda: len(rig.polar(settled_ns)) >= 6)
     unplugged, pulled_ns = rig.begin(fault)
     for source in lost:
@@ -474,7 +470,7 @@ def test_a_lost_device_is_seen_goes_stale_and_comes_back(rig: Rig, fault: str, l
         assert event.state in (LinkState.ABSENT, LinkState.SILENT)
         assert 0 <= event.stamp_ns - pulled_ns <= SEEN_NS
         assert event.text
-    wait_for("more sectors", lambda: time.monotonic_ns() > pulled_ns + SEEN_NS + SECOND // 5)
+    wait_for("more sectors", lambda: rig.clock() > pulled_ns + SEEN_NS + SECOND // 5)
     plugged_ns = rig.end(unplugged)
     for source in lost:
         event = rig.next_event(source, plugged_ns, running=True)
@@ -493,7 +489,7 @@ def test_a_lost_device_is_seen_goes_stale_and_comes_back(rig: Rig, fault: str, l
 def test_a_plug_pulled_by_hand(rig: Rig, ask_person: Callable[[str], None]) -> None:
     """On emulators the hand is a fault; on hardware a person's."""
     source = next(iter(rig.sensors))
-    begin_ns = time.monotonic_ns()
+    begin_ns = rig.clock()
     wait_for("readings", lambda: len(rig.readings(source, begin_ns)) >= enough(rig))
     if rig.is_real:
         ask_person(f"unplug the {rig.kind}")
@@ -502,7 +498,7 @@ def test_a_plug_pulled_by_hand(rig: Rig, ask_person: Callable[[str], None]) -> N
     event = rig.next_event(source, begin_ns, running=False)
     last_ns = max(reading.stamp_ns for reading in rig.readings(source) if reading.stamp_ns < event.stamp_ns)
     assert event.stamp_ns - last_ns <= SEEN_NS + SECOND // 5  # the last reading is up to a period older than its loss
-    wait_for("staleness", lambda: time.monotonic_ns() > event.stamp_ns + SEEN_NS)
+    wait_for("staleness", lambda: rig.clock() > event.stamp_ns + SEEN_NS)
     for _, snapshot in rig.polar(event.stamp_ns + SEEN_NS):
         assert {int(s) for s in snapshot.state} <= {int(SectorState.STALE), int(SectorState.UNKNOWN)}
     if rig.is_real:
@@ -510,8 +506,8 @@ def test_a_plug_pulled_by_hand(rig: Rig, ask_person: Callable[[str], None]) -> N
     else:
         rig.end(fault)
     port = rig.reader.health()
-    plugged_ns = time.monotonic_ns()
-    back = rig.next_event(source, event.stamp_ns + 1, running=True, within_s=30.0)
+    plugged_ns = rig.clock()
+    back = rig.next_event(source, event.stamp_ns + 1, running=True)
     assert back.stamp_ns - plugged_ns <= RECOVERED_NS + (4 * SECOND if rig.is_real else 0), port
 
 

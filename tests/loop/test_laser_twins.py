@@ -19,11 +19,11 @@ import pytest
 from drivers.readings import DeviceEvent, LinkState, Reading, ScanReading
 from service.assemble import wires
 from service.config import load
+from tests.waiting import GIVE_UP_S, wait_for
 
 TWINS = ["lms200", "rplidar-a1", "rplidar-a2", "ld06", "tim571"]
 READINGS = 4
 WORLD = "office"  # seen from its start, left and right differ
-DEADLINE_S = 25.0
 
 
 @contextmanager
@@ -47,15 +47,12 @@ def standing_robot(model: str, folder: Path) -> Iterator[Path]:
     )
     try:
         config = folder / "umfeld.toml"
-        deadline = time.monotonic() + DEADLINE_S
-        while not config.exists():
-            assert process.poll() is None, f"the simulation ended with {process.returncode}"
-            assert time.monotonic() < deadline, "no configuration came"
-            time.sleep(0.02)
+        wait_for("the configuration", lambda: config.exists() or process.poll() is not None)
+        assert process.poll() is None, f"the simulation ended with {process.returncode}"
         yield config
     finally:
         process.terminate()
-        process.wait(5)
+        process.wait(GIVE_UP_S)
 
 
 def scans(model: str, folder: Path) -> list[ScanReading]:
@@ -73,11 +70,10 @@ def scans(model: str, folder: Path) -> list[ScanReading]:
         (wire,) = [each for each in wires(load(path, environment={}).config) if "front" in each.conversations]
         reader = wire.reader(sink, time.monotonic_ns)
         reader.start()
-        deadline = time.monotonic() + DEADLINE_S
-        while len(found) < READINGS and time.monotonic() < deadline:
-            time.sleep(0.02)
-        reader.stop()
-    assert len(found) >= READINGS, troubles
+        try:
+            wait_for("scans", lambda: len(found) >= READINGS)
+        finally:
+            assert reader.stop(GIVE_UP_S), troubles
     return found
 
 

@@ -4,40 +4,24 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from service.cdr import decode_cloud, decode_grid
-from service.zenoh_session import Client
+from tests.clients import connected, document
+from tests.waiting import GIVE_UP_S, free_port, wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE = "robots/nodding"
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def wait_for(what: str, ready: Callable[[], Any], seconds: float = 60.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (result := ready()):
-        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
-        time.sleep(0.05)
-    return result
-
-
-def floor_of(document: Any) -> list[Any]:
+def floor_of(told: Any) -> list[Any]:
     """Level planes at the height of the wheels."""
-    planes = [] if document is None else document["planes"]
+    planes = [] if told is None else told["planes"]
     return [each for each in planes if abs(each["normal"][2]) > 0.99 and abs(each["centre_m"][2]) < 0.03]
 
 
@@ -67,35 +51,26 @@ def test_a_nodding_laser_shows_floor_and_walls(tmp_path: Path) -> None:
         wait_for("the devices", lambda: (tmp_path / "umfeld.toml").exists() and (tmp_path / "laser-tilt").exists())
         start("service", "run", "--config", str(tmp_path / "umfeld.toml"))
 
-        def connected() -> Client | None:
-            try:
-                client = Client(endpoint)
-            except Exception:
-                return None
-            if client.bases() == [BASE]:
-                return client
-            client.close()
-            return None
-
-        with wait_for("the daemon", connected, 90.0) as client:  # it may have to compile
-
-            def planes() -> Any:
-                found = client.get(f"{BASE}/map/planes")
-                return json.loads(found[0].payload) if found else None
+        with connected(endpoint, BASE) as client:
 
             def upright_of(told: Any) -> list[Any]:
                 return [plane for plane in told["planes"] if abs(plane["normal"][2]) < 0.03]
 
             def floor_and_walls() -> Any:
-                told = planes()
+                told = document(client, f"{BASE}/map/planes")
                 return told if floor_of(told) and len(upright_of(told)) >= 2 else None
 
-            document = wait_for("planes: the floor, and two walls that stand upright", floor_and_walls)
-            cloud = decode_cloud(wait_for("a cloud", lambda: client.get(f"{BASE}/cloud/mast"))[0].payload)
+            flat = wait_for("planes: the floor, and two walls that stand upright", floor_and_walls)
+
+            def whole_cloud() -> Any:
+                found = client.get(f"{BASE}/cloud/mast")
+                told = decode_cloud(found[0].payload) if found else None
+                return told if told and len(told.points_m) > 20_000 else None
+
+            cloud = wait_for("a cloud of a whole sweep", whole_cloud)
 
             def elevation() -> Any:
-                found = client.get(f"{BASE}/map/elevation")
-                told = json.loads(found[0].payload) if found else None
+                told = document(client, f"{BASE}/map/elevation")
                 return told if told and told["cells"]["traversable"] > 100 and is_flat(told) else None
 
             ground = wait_for("a hundred cells of ground, at the height of the wheels", elevation)
@@ -107,19 +82,26 @@ def test_a_nodding_laser_shows_floor_and_walls(tmp_path: Path) -> None:
                 return found if any(each["traversable_m"] > 0.0 for each in found) else None
 
             told = wait_for("sectors that know the ground", sectors)
-            clearance = decode_grid(wait_for("clearance", lambda: client.get(f"{BASE}/map/clearance"))[0].payload)
-            health = json.loads(client.get(f"{BASE}/health/json")[0].payload)
-        assert document["schema"] == "umfeld.planes.v1"
-        assert {plane["mount"] for plane in document["planes"]} == {"mast"}
+
+            def clearance() -> bool:
+                found = client.get(f"{BASE}/map/clearance")
+                return bool(found) and {-1, 100} < set(np.unique(decode_grid(found[0].payload).cells).tolist())
+
+            wait_for("clearance: known somewhere, not everywhere", clearance)
+
+            def sources() -> set[str]:
+                health = document(client, f"{BASE}/health/json")
+                return {each["name"] for each in health["sources"]} if health else set()
+
+            wait_for("health of lasers and mount", lambda: sources() >= {"front", "tilt", "mast"})
+        assert flat["schema"] == "umfeld.planes.v1"
+        assert {plane["mount"] for plane in flat["planes"]} == {"mast"}
         assert ground["schema"] == "umfeld.elevation.v1"
         assert all(each["slope_rad"] is not None for each in told if each["traversable"])
-        assert {-1, 100} < set(np.unique(clearance.cells).tolist())
         assert cloud.frame == "base_link"
-        assert len(cloud.points_m) > 20_000
         assert 0.02 < np.mean(np.abs(cloud.points_m[:, 2]) < 0.05) < 0.95
-        assert {each["name"] for each in health["sources"]} >= {"front", "tilt", "mast"}
     finally:
         for process in processes[::-1]:
             process.send_signal(signal.SIGTERM)
         for process in processes:
-            process.wait(20)
+            process.wait(GIVE_UP_S)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,22 +18,10 @@ from service.export import MapImage, load_pgm_yaml
 from service.recording_log import read_any_log
 from service.replay import Recording, Replay
 from service.zenoh_session import Client
+from tests.clients import connected
+from tests.waiting import GIVE_UP_S, START_S, free_port, wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def wait_for(what: str, ready: Callable[[], Any], seconds: float = 40.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (result := ready()):
-        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
-        time.sleep(0.05)
-    return result
 
 
 class Robot:
@@ -73,25 +59,14 @@ class Robot:
             cwd=ROOT,
             capture_output=True,
             text=True,
-            timeout=90,
+            timeout=START_S,
             check=False,
         )
         assert done.returncode == 0, done.stderr + self.logs()
         return done.stdout
 
     def client(self) -> Client:
-        def attempt() -> Client | None:
-            try:
-                client = Client(self.endpoint)
-            except Exception:
-                return None
-            if client.bases():
-                return client
-            client.close()
-            return None
-
-        found: Client = wait_for("the daemon", attempt)
-        return found
+        return connected(self.endpoint, "robots/artos")
 
 
 @pytest.fixture
@@ -130,7 +105,7 @@ def test_a_recording_from_the_first_byte_gives_the_map_that_was_made_live(robot:
     sim.send_signal(signal.SIGCONT)
     time.sleep(2.0)
     daemon.send_signal(signal.SIGTERM)
-    assert daemon.wait(20) == 0, robot.logs()
+    assert daemon.wait(GIVE_UP_S) == 0, robot.logs()
     (path,) = sorted((robot.folder / "recordings").glob("*.mcap"))
 
     report = Replay(Recording.of(path)).run()
@@ -174,7 +149,7 @@ def test_a_running_daemon_records_on_request_and_its_replay_is_always_the_same(r
     assert [Path(line).parent for line in lines] == [out]
     assert robot.command("record", "--connect", robot.endpoint, "--stop").strip() == "nothing was being recorded"
     daemon.send_signal(signal.SIGTERM)
-    assert daemon.wait(20) == 0, robot.logs()
+    assert daemon.wait(GIVE_UP_S) == 0, robot.logs()
     reports = [Replay(Recording.of(Path(lines[0]))).run() for _ in range(2)]
     assert reports[0] == reports[1]
     assert reports[0].same_map is None, "what the daemon knew before is not in it"

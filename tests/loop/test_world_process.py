@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from service.config import load
+from tests.waiting import GIVE_UP_S, wait_for
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,11 +36,8 @@ def simulation(
         cwd=ROOT,
     )
     try:
-        deadline = time.monotonic() + 30.0
-        while not (folder / "umfeld.toml").exists():
-            assert process.poll() is None, process.communicate()[1].decode()
-            assert time.monotonic() < deadline
-            select.select([], [], [], 0.02)
+        wait_for("the configuration", lambda: (folder / "umfeld.toml").exists() or process.poll() is not None)
+        assert process.poll() is None, process.communicate()[1].decode()
         yield process
     finally:
         if process.poll() is None:
@@ -49,13 +47,20 @@ def simulation(
 
 def ended(process: subprocess.Popen[bytes], number: int = signal.SIGTERM) -> tuple[int, str, str]:
     process.send_signal(number)
-    out, err = process.communicate(timeout=20)
+    out, err = process.communicate(timeout=GIVE_UP_S)
     return process.returncode, out.decode(), err.decode()
+
+
+def played(*arguments: str) -> tuple[int, str, str]:
+    """A simulation that ends by itself; it may be over before anybody has seen its files."""
+    command = [sys.executable, "-m", "sim_devices", *arguments]
+    done = subprocess.run(command, capture_output=True, cwd=ROOT, timeout=GIVE_UP_S, check=False)
+    return done.returncode, done.stdout.decode(), done.stderr.decode()
 
 
 def refused(*arguments: str) -> tuple[int, str]:
     done = subprocess.run(
-        [sys.executable, "-m", "sim_devices", *arguments], capture_output=True, cwd=ROOT, timeout=30, check=False
+        [sys.executable, "-m", "sim_devices", *arguments], capture_output=True, cwd=ROOT, timeout=GIVE_UP_S, check=False
     )
     assert done.stdout == b""
     return done.returncode, done.stderr.decode()
@@ -67,7 +72,7 @@ def asked(path: Path, question: bytes, ending: bytes) -> bytes:
     try:
         os.write(file, question)
         answer = b""
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + GIVE_UP_S
         while not answer.endswith(ending) and time.monotonic() < deadline:
             if select.select([file], [], [], 0.1)[0]:
                 answer += os.read(file, 4096)
@@ -131,11 +136,8 @@ def test_its_own_configuration_can_be_emulated_again(tmp_path: Path) -> None:
     with simulation(first) as process:
         (tmp_path / "config.toml").write_text((first / "umfeld.toml").read_text())
         ended(process)
-    with simulation(second, "--config", str(tmp_path / "config.toml"), "--duration", "2") as process:
-        text = (second / "umfeld.toml").read_text()
-        out, _ = process.communicate(timeout=20)
-    assert process.returncode == 0
-    assert out.decode() == text
+    code, text, _ = played("--dir", str(second), "--config", str(tmp_path / "config.toml"), "--duration", "0.5")
+    assert code == 0
     again = load_text(text, tmp_path)
     assert again["can"]["main"]["channel"] == str(second / "can-main")
 
@@ -153,10 +155,9 @@ def truth(path: Path) -> list[dict[str, float]]:
 
 def test_the_robot_waits_for_a_host_unless_told_when(tmp_path: Path) -> None:
     waiting, driving = tmp_path / "waiting.jsonl", tmp_path / "driving.jsonl"
-    with simulation(tmp_path / "a", "--truth", str(waiting), "--duration", "1.5") as process:
-        process.communicate(timeout=20)
-    with simulation(tmp_path / "b", "--truth", str(driving), "--start-after", "0", "--duration", "1.5") as process:
-        process.communicate(timeout=20)
+    assert played("--dir", str(tmp_path / "a"), "--truth", str(waiting), "--duration", "1.5")[0] == 0
+    options = ("--truth", str(driving), "--start-after", "0", "--duration", "1.5")
+    assert played("--dir", str(tmp_path / "b"), *options)[0] == 0
     assert {(row["x"], row["y"]) for row in truth(waiting)} == {(1.0, 4.1)}
     rows = truth(driving)
     assert rows[-1]["x"] > 1.2
@@ -169,9 +170,7 @@ def test_drive_commands_move_the_robot(tmp_path: Path) -> None:
         assert process.stdin is not None
         process.stdin.write(b"nonsense\n0.5 0 0.6\n")
         process.stdin.flush()
-        deadline = time.monotonic() + 20.0
-        while time.monotonic() < deadline and (not path.exists() or not moved(path, 0.3)):
-            select.select([], [], [], 0.05)
+        wait_for("the way", lambda: path.exists() and moved(path, 0.3), every_s=0.05)
         _, _, err = ended(process)
     assert truth(path)[-1]["x"] == pytest.approx(1.3, abs=1e-6)
     assert "is no command" in err
@@ -189,11 +188,11 @@ def test_a_log_is_played_to_its_end(tmp_path: Path) -> None:
         for k in range(5)
     ]
     log.write_text("\n".join(lines) + "\n")
-    options = ["--log", str(log), "--start-after", "0.1", "--until-end", "--truth", str(path)]
+    options = ["--log", str(log), "--until-end", "--truth", str(path)]  # it begins when it is spoken to
     with simulation(tmp_path / "sim", *options, command=("-m", "service", "sim")) as process:
         config = load(tmp_path / "sim" / "umfeld.toml").config
-        told = asked(tmp_path / "sim" / "laser-front", b"PP\n", b"\n\n") if process.poll() is None else b""
-        _, err = process.communicate(timeout=20)
+        told = asked(tmp_path / "sim" / "laser-front", b"PP\n", b"\n\n")
+        _, err = process.communicate(timeout=GIVE_UP_S)
     assert process.returncode == 0
     assert not config.sonars
     assert b"ARES:360" in told
@@ -204,12 +203,7 @@ def test_a_log_is_played_to_its_end(tmp_path: Path) -> None:
 
 def test_a_fault_on_the_command_line_pulls_the_plug(tmp_path: Path) -> None:
     folder = tmp_path / "sim"
-    with simulation(folder, "--fault", "laser:unplug@0s+1500ms") as process:
-        deadline = time.monotonic() + 20.0
-        states: list[bool] = []
-        while time.monotonic() < deadline and not (states and states[-1] and not all(states)):
-            states.append((folder / "laser-front").exists())
-            select.select([], [], [], 0.02)
-        assert False in states
-        assert states[-1], "the wire comes back"
+    with simulation(folder, "--fault", "laser:unplug@0s+3s") as process:
+        wait_for("the plug to be pulled", lambda: not (folder / "laser-front").exists())
+        wait_for("the wire to come back", lambda: (folder / "laser-front").exists())
         assert ended(process)[0] == 0

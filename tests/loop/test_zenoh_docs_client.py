@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from service.clock import SystemClock
 from service.outputs import GridOut, GridUpdateOut, PolarOut
 from service.publisher import Publisher
 from service.zenoh_session import NetworkSettings
+from tests.waiting import GIVE_UP_S, free_port
 
 PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
 
@@ -28,9 +28,7 @@ def printed_client() -> str:
 
 
 def test_the_client_in_the_docs_draws_sectors_and_grid(tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     script = tmp_path / "client.py"
     script.write_text(printed_client())
     publisher = Publisher("robots/r1", NetworkSettings(listen=(endpoint,)), clock=SystemClock())
@@ -50,7 +48,7 @@ def test_the_client_in_the_docs_draws_sectors_and_grid(tmp_path: Path) -> None:
         np.zeros(3, np.int16),
         ("front",),
     )
-    command = [sys.executable, str(script), endpoint, "2.5"]
+    command = [sys.executable, str(script), endpoint, "4"]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         while process.poll() is None:
@@ -61,7 +59,7 @@ def test_the_client_in_the_docs_draws_sectors_and_grid(tmp_path: Path) -> None:
         out, err = process.communicate()
     finally:
         process.kill()
-        assert publisher.close()
+        assert publisher.close(GIVE_UP_S)
     assert process.returncode == 0, err
     assert "robots/r1/sectors/polar/laser 1.25 m" in out
     assert "grid 4 x 3 of 0.100 m at 0.30, -0.20, epoch 5" in out

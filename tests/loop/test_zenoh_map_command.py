@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from service.publisher import Publisher
 from service.rpc import CallRefused
 from service.store import MapStore, list_maps, write_occupancy_map
 from service.zenoh_session import NetworkSettings
+from tests.waiting import GIVE_UP_S, free_port, wait_for
 
 CELLS = np.array([[0, 0, 100, -1], [0, -1, 100, 0], [100, 0, 0, 0]], np.int8)
 
@@ -50,15 +49,13 @@ class Maps:
 
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    address = f"tcp/127.0.0.1:{free_port()}"
     publisher = Publisher("robots/r1", NetworkSettings(listen=(address,)), clock=SystemClock())
     publisher.calls.register_map_service(Maps(tmp_path_factory.mktemp("maps")))
     publisher.start()
     publisher.offer(GridOut(1, 1, GridPatch(0.1, -5, 7, CELLS)))
     yield address
-    assert publisher.close()
+    assert publisher.close(GIVE_UP_S)
 
 
 @pytest.fixture
@@ -106,9 +103,7 @@ def test_save_list_load_info_of_a_daemon(umfeld: Run, endpoint: str) -> None:
 
 
 def test_export_of_the_live_grid(umfeld: Run, endpoint: str, tmp_path: Path) -> None:
-    end = time.monotonic() + 5
-    while umfeld("export", tmp_path / "live.yaml", "--connect", endpoint)[0] != 0:
-        assert time.monotonic() < end
+    wait_for("a grid", lambda: umfeld("export", tmp_path / "live.yaml", "--connect", endpoint)[0] == 0)
     image = load_pgm_yaml(tmp_path / "live.yaml")
     np.testing.assert_array_equal(image.cells, CELLS)
     assert (image.resolution_m, image.origin.x_m, image.origin.y_m) == pytest.approx((0.1, 0.7, -0.5))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -21,6 +20,7 @@ from service.outputs import GridOut, HealthOut, OdomOut, PoseOut, ScanOut
 from service.publisher import Publisher
 from service.ros import RosSettings
 from service.zenoh_session import NetworkSettings
+from tests.waiting import GIVE_UP_S, free_port
 
 ROS_SIDE = """
 import json, sys, threading, time
@@ -49,7 +49,7 @@ for topic, kind in wanted.items():
     late = QosProfile(durability=QosDurability.TRANSIENT_LOCAL) if topic == "/map" else None
     subscribers.append(ROS2Subscriber(topic, kind, taker(topic), msg_definition=text, router_port=port, qos=late,
                                       type_hash=store.hash_rihs01(kind), domain_id=0))
-end = time.monotonic() + 10
+end = time.monotonic() + 60
 while time.monotonic() < end and len(seen) < len(wanted):
     time.sleep(0.02)
 result = {topic: stamp(message) for topic, message in seen.items()}
@@ -75,9 +75,7 @@ WANTED = {
 
 @pytest.mark.skipif(find_spec("zenoh_ros2_sdk") is None, reason="needs zenoh-ros2-sdk from PyPI")
 def test_an_independent_ros_client_sees_everything(tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     script = tmp_path / "ros_side.py"
     script.write_text(ROS_SIDE)
     network = NetworkSettings(listen=(f"tcp/127.0.0.1:{port}",))
@@ -108,7 +106,7 @@ def test_an_independent_ros_client_sees_everything(tmp_path: Path) -> None:
         out, err = process.communicate()
     finally:
         process.kill()
-        assert publisher.close()
+        assert publisher.close(GIVE_UP_S)
     assert process.returncode == 0, err
     answer = json.loads(out.strip().splitlines()[-1])
     seen = answer["seen"]

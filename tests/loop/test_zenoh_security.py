@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,8 @@ from service.clock import SystemClock
 from service.outputs import GridOut, ScanOut
 from service.publisher import Publisher
 from service.zenoh_session import CallFailed, Client, NetworkSettings, NetworkTrouble, TlsFiles
+from tests.clients import PatientClient
+from tests.waiting import GIVE_UP_S, free_port, wait_for
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 BASE = "robots/r1"
@@ -60,10 +60,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def endpoints(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    return f"unixsock-stream/{tmp_path_factory.mktemp('run')}/zenoh.sock", f"tls/127.0.0.1:{port}"
+    return f"unixsock-stream/{tmp_path_factory.mktemp('run')}/zenoh.sock", f"tls/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +77,7 @@ def publisher(certificates: Path, endpoints: tuple[str, str]) -> Iterator[Publis
     made.start()
     made.offer(GridOut(1, 1, GridPatch(0.1, 0, 0, np.zeros((2, 2), np.int8))))
     yield made
-    assert made.close()
+    assert made.close(GIVE_UP_S)
 
 
 def client_of(certificates: Path, endpoint: str, name: str | None) -> Client:
@@ -94,15 +91,11 @@ def client_of(certificates: Path, endpoint: str, name: str | None) -> Client:
         }
     path = certificates / f"client-{name}.json5"
     path.write_text(json.dumps({"transport": {"unicast": {"compression": {"enabled": True}}, "link": {"tls": tls}}}))
-    return Client(endpoint, zenoh_config=path)
+    return PatientClient(endpoint, zenoh_config=path)
 
 
-def wait_until(condition: Callable[[], Any], seconds: float = 5.0) -> Any:
-    end = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
-    return value
+def wait_until(condition: Callable[[], Any]) -> Any:
+    return wait_for("what was waited for", condition, every_s=0.02)
 
 
 def scan(publisher: Publisher) -> None:
@@ -131,7 +124,7 @@ def test_only_operators_call(publisher: Publisher, certificates: Path, endpoints
         assert operator.call(BASE, "greet") == {"hello": True}
     answered = publisher.calls.answered
     with client_of(certificates, endpoints[1], "viewer") as viewer:
-        assert viewer.get(f"{BASE}/map/grid")  # it is connected
+        wait_until(lambda: viewer.get(f"{BASE}/map/grid"))  # it is connected
         with pytest.raises(CallFailed, match="does not answer"):
             viewer.call(BASE, "greet", timeout_s=0.7)
     assert publisher.calls.answered == answered
@@ -172,7 +165,7 @@ def test_the_owner_on_the_robot_may_do_everything(
 ) -> None:
     with client_of(certificates, endpoints[0], None) as owner:
         assert owner.call(BASE, "greet") == {"hello": True}
-        assert owner.get(f"{BASE}/map/**")
+        wait_until(lambda: owner.get(f"{BASE}/map/**"))
 
 
 @pytest.mark.parametrize("name", [None, "forged"])

@@ -18,6 +18,7 @@ from drivers.ports import CanPort
 from drivers.queues import BoundedQueue
 from drivers.reader import WireReader
 from drivers.readings import AngleReading, DeviceEvent, Identity, LinkState, Reading, WheelReading
+from tests.waiting import GIVE_UP_S, SteadyClock
 
 MS = 1_000_000
 LEFT, RIGHT = 0x20, 0x21
@@ -322,7 +323,7 @@ def data_sheet(tmp_path: Path) -> Path:
 
 def ask_judge(port: CanPort, client: SdoClient, question: Upload | Download) -> SdoDone:
     client.ask(question, time.monotonic_ns())
-    deadline_ns = time.monotonic_ns() + 5_000 * MS
+    deadline_ns = time.monotonic_ns() + 60_000 * MS
     while time.monotonic_ns() < deadline_ns:
         frames, done = client.requests(time.monotonic_ns())
         for frame in frames:
@@ -338,7 +339,7 @@ def ask_judge(port: CanPort, client: SdoClient, question: Upload | Download) -> 
 def test_sdo_against_an_independent_server(data_sheet: Path) -> None:
     judge = Judge("sdo-judge", 0x21, data_sheet, lambda: 0)
     port = CanPort(interface="virtual", channel="sdo-judge", clock=time.monotonic_ns)
-    client = SdoClient(0x21, timeout_ns=1_000 * MS)
+    client = SdoClient(0x21, timeout_ns=60_000 * MS)
     try:
         assert ask_judge(port, client, Upload(0x1000)).number == 0x00020196
         assert ask_judge(port, client, Upload(0x1018, 1)).number == 0x42
@@ -358,10 +359,11 @@ def test_sdo_against_an_independent_server(data_sheet: Path) -> None:
 
 def test_the_pair_runs_on_two_independent_nodes(data_sheet: Path) -> None:
     """Everything together: reader thread, python-can, two nodes of the `canopen` package."""
-    start_ns = time.monotonic_ns()
+    clock = SteadyClock()
+    start_ns = clock()
 
     def travel() -> int:
-        return (time.monotonic_ns() - start_ns) // MS  # a tick a millisecond
+        return (clock() - start_ns) // MS  # a tick a millisecond
 
     judges = [
         Judge("pair-judge", LEFT, data_sheet, travel),
@@ -370,15 +372,15 @@ def test_the_pair_runs_on_two_independent_nodes(data_sheet: Path) -> None:
     queue: BoundedQueue[Reading | DeviceEvent] = BoundedQueue(1000)
     reader = WireReader(
         "main",
-        lambda: CanPort(interface="virtual", channel="pair-judge", clock=time.monotonic_ns),
+        lambda: CanPort(interface="virtual", channel="pair-judge", clock=clock),
         {"drive": Cia406PairConversation(LEFT, RIGHT)},
         queue.put,
-        clock=time.monotonic_ns,
+        clock=clock,
     )
     reader.start()
     readings: list[WheelReading] = []
     events: list[DeviceEvent] = []
-    deadline = time.monotonic() + 15.0
+    deadline = time.monotonic() + GIVE_UP_S
     try:
         while len(readings) < 60 and time.monotonic() < deadline:
             for source, item in queue.get_all(0.1):
@@ -388,9 +390,10 @@ def test_the_pair_runs_on_two_independent_nodes(data_sheet: Path) -> None:
                 elif isinstance(item, WheelReading):
                     readings.append(item)
     finally:
-        assert reader.stop(2.0)
+        assert reader.stop(GIVE_UP_S)
         for judge in judges:
             judge.close()
+        clock.stop()
     assert len(readings) >= 60, events
     assert [reading.continuous for reading in readings[:5]] == [False, True, True, True, True]
     steps = [

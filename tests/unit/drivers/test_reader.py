@@ -28,6 +28,7 @@ from drivers.readings import (
     Reading,
     SourceCounters,
 )
+from tests.waiting import GIVE_UP_S, wait_for
 
 MS = 1_000_000
 
@@ -599,7 +600,7 @@ class LivePort:
             self.explode = False
             raise ZeroDivisionError("bug in a port")
         if self.hang is not None:
-            self.hang.wait(30.0)
+            self.hang.wait(2 * GIVE_UP_S)
         time.sleep(timeout_s)
         return [(b"!", time.monotonic_ns())]
 
@@ -615,13 +616,6 @@ class LivePort:
         return None
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
 def test_thread_runs_and_stops_with_farewell() -> None:
     port = LivePort()
     queue: BoundedQueue[Reading | DeviceEvent] = BoundedQueue(1000)
@@ -629,9 +623,9 @@ def test_thread_runs_and_stops_with_farewell() -> None:
         "live", lambda: port, {"front": Talker()}, queue.put, clock=time.monotonic_ns
     )
     reader.start()
-    wait_for(lambda: len(queue) > 5)
+    wait_for("the thread", lambda: len(queue) > 5)
     assert reader.health().sources["front"].state is LinkState.RUNNING
-    assert reader.stop(2.0)
+    assert reader.stop(GIVE_UP_S)
     assert port.written == [b"bye"]
     assert port.closed
 
@@ -645,8 +639,8 @@ def test_thread_survives_a_bug_in_the_port() -> None:
         "live", lambda: next(waiting), {"front": Talker()}, queue.put, clock=time.monotonic_ns
     )
     reader.start()
-    wait_for(lambda: reader.health().sources["front"].readings > 3)
-    assert reader.stop(2.0)
+    wait_for("the thread", lambda: reader.health().sources["front"].readings > 3)
+    assert reader.stop(GIVE_UP_S)
     assert ports[0].closed
 
 
@@ -656,10 +650,10 @@ def test_stop_does_not_wait_for_a_hanging_wire() -> None:
         "live", lambda: LivePort(hang), {"front": Talker()}, lambda source, item: None, clock=time.monotonic_ns
     )
     reader.start()
-    wait_for(lambda: reader.health().is_open)
+    wait_for("the thread", lambda: reader.health().is_open)
     started = time.monotonic()
     assert not reader.stop(0.2)
-    assert time.monotonic() - started < 1.0
+    assert time.monotonic() - started < GIVE_UP_S, "the wire hangs for twice as long"
     hang.set()
 
 
@@ -699,7 +693,7 @@ def test_queue_of_events_only_drops_the_oldest() -> None:
 def test_queue_wakes_the_waiting() -> None:
     queue: BoundedQueue[Reading | DeviceEvent] = BoundedQueue(2)
     threading.Timer(0.05, queue.put, ("x", reading_at(7))).start()
-    got = queue.get(5.0)
+    got = queue.get(GIVE_UP_S)
     assert got is not None
     assert got[1].stamp_ns == 7
 

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from drivers.readings import DeviceEvent, LinkState, ScanReading
 from mapping.frames import Pose2
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
-from service.clock import CrankedClock, SystemClock
+from service.clock import CrankedClock, SystemClock, wall_offset_ns
 from service.daemon import Daemon, network_settings
 from service.errors import Trouble
 from service.fusion import Fusion, Parts
@@ -31,6 +32,7 @@ from service.sensors import Laser
 from service.store import MapStore, occupancy_patch
 from service.systemd import Notifier
 from service.worker import Worker
+from tests.waiting import GIVE_UP_S
 
 SECOND = 1_000_000_000
 
@@ -118,7 +120,7 @@ def test_others_ask_between_readings_and_get_results_and_errors() -> None:
         with pytest.raises(ZeroDivisionError):
             worker.ask(lambda: 1 // 0)
     finally:
-        assert worker.stop(5.0)
+        assert worker.stop(GIVE_UP_S)
     assert worker.ask(lambda: 7) == 7  # after the thread has ended the maps belong to whoever asks
 
 
@@ -129,13 +131,13 @@ def test_who_asks_as_the_thread_ends_is_answered(monkeypatch: pytest.MonkeyPatch
 
     def slow(_source: str, _item: object, _now_ns: int) -> list[Output]:
         late.set()
-        assert go_on.wait(10.0)
+        assert go_on.wait(GIVE_UP_S)
         return []
 
     monkeypatch.setattr(office.fusion, "stream", slow)
     office.worker.start()
     office.worker.sink("front", scan(SECOND))
-    assert late.wait(10.0)
+    assert late.wait(GIVE_UP_S)
     assert not office.worker.stop(0.0)
     office.worker.turn(0.0)  # the last turn has taken what there was
     threading.Timer(0.1, go_on.set).start()
@@ -187,7 +189,7 @@ from service.locks import Claims
 claims = Claims()
 claims.claim_ports(sys.argv[1:])
 print("held", flush=True)
-time.sleep(60)
+time.sleep(600)
 """
     holder = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "tty")], stdout=subprocess.PIPE)
     assert holder.stdout is not None
@@ -397,7 +399,7 @@ def test_the_service_manager_hears_ready_beats_and_stopping(tmp_path: Path) -> N
     address = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(address))
-        manager.settimeout(1.0)
+        manager.settimeout(GIVE_UP_S)
         notifier = Notifier({"NOTIFY_SOCKET": str(address), "WATCHDOG_USEC": "10000000"})
         assert notifier.watched
         notifier.ready("4 devices")
@@ -413,7 +415,7 @@ def test_an_abstract_address_and_a_deaf_manager() -> None:
     name = f"@umfeld-test-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind("\0" + name[1:])
-        manager.settimeout(1.0)
+        manager.settimeout(GIVE_UP_S)
         Notifier({"NOTIFY_SOCKET": name}).status("x")
         assert manager.recv(100) == b"STATUS=x"
     Notifier({"NOTIFY_SOCKET": name}).status("nobody listens")
@@ -436,6 +438,15 @@ def test_the_system_clocks_agree_with_the_system() -> None:
     before = time.time_ns()
     wall = clock.wall_from_monotonic_ns(clock.now_ns())
     assert before - 5_000_000 <= wall <= time.time_ns() + 5_000_000
+
+
+def test_a_label_is_right_although_the_clocks_were_not_read_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process was stopped for a second between two readings; the next ones are close together."""
+    monotonic = iter((10 * SECOND, 11 * SECOND, 12 * SECOND, 12 * SECOND + 200))
+    wall = iter((110 * SECOND, 112 * SECOND + 100))
+    clocks = SimpleNamespace(monotonic_ns=lambda: next(monotonic), time_ns=lambda: next(wall))
+    monkeypatch.setattr("service.clock.time", clocks)
+    assert wall_offset_ns() == 100 * SECOND
 
 
 def test_a_cranked_clock_moves_when_turned() -> None:

@@ -22,6 +22,7 @@ from service.payloads import Message
 from service.publisher import Outbox, Parcel, Publisher, slot_of
 from service.rpc import _NEEDS, CallRefused, Calls, map_name
 from service.zenoh_session import NetworkSettings, is_loopback, refuse_open_listeners
+from tests.waiting import GIVE_UP_S
 
 
 def parcel(number: int) -> Parcel:
@@ -88,11 +89,11 @@ def test_who_takes_sleeps_until_it_is_woken() -> None:
         outbox.put("b", parcel(2 * round_ + 1), wake=round_ % 2 == 0)
         if round_ % 2:
             outbox.wake()
-        assert came.acquire(timeout=5.0)
-        assert came.acquire(timeout=5.0)
+        assert came.acquire(timeout=GIVE_UP_S)
+        assert came.acquire(timeout=GIVE_UP_S)
     outbox.put("a", parcel(100), wake=False)
     outbox.close()
-    thread.join(5.0)
+    thread.join(GIVE_UP_S)
     assert numbers == list(range(101))
 
 
@@ -113,7 +114,7 @@ def test_take_waits_and_close_wakes_it() -> None:
     thread = threading.Thread(target=lambda: got.append(outbox.take()))
     thread.start()
     outbox.close()
-    thread.join(5)
+    thread.join(GIVE_UP_S)
     assert got == [None]
 
 
@@ -224,11 +225,11 @@ def test_bad_arguments_are_refused_in_words(payload: bytes, complaint: str) -> N
     ask = started(calls)
     query = FakeQuery("robots/r/@rpc/go", payload)
     ask(query)
-    assert query.ended.wait(5)
+    assert query.ended.wait(GIVE_UP_S)
     assert complaint in query.errors[0]
     fine = FakeQuery("robots/r/@rpc/go", b'{"a": 1}')
     ask(fine)
-    assert fine.ended.wait(5)
+    assert fine.ended.wait(GIVE_UP_S)
     assert fine.replies == [{"got": {"a": 1}}]
     calls.stop(5)
 
@@ -238,7 +239,7 @@ def test_too_many_calls_are_refused_and_none_is_left_hanging() -> None:
     calls = Calls("robots/r")
 
     def slow(_arguments: Any) -> dict[str, Any]:
-        gate.wait(10)
+        gate.wait(GIVE_UP_S)
         return {}
 
     calls.register("slow", slow)
@@ -251,7 +252,7 @@ def test_too_many_calls_are_refused_and_none_is_left_hanging() -> None:
     assert all("busy" in query.errors[0] for query in refused)
     assert calls.refused == len(refused)
     gate.set()
-    assert all(query.ended.wait(5) for query in queries)
+    assert all(query.ended.wait(GIVE_UP_S) for query in queries)
     assert calls.answered == len(queries) - len(refused)
     calls.stop(5)
 
@@ -288,7 +289,7 @@ def test_the_map_service_answers_its_calls() -> None:
     for name, payload in (("save_map", b'{"name":"flat"}'), ("load_map", b'{"name":"x"}'), ("map_info", None)):
         query = FakeQuery(f"robots/r/@rpc/{name}", payload)
         ask(query)
-        assert query.ended.wait(5)
+        assert query.ended.wait(GIVE_UP_S)
         answers[name] = query.replies or query.errors
     assert answers == {"save_map": [{"saved": "flat"}], "load_map": ["no map x"], "map_info": [{"rows": 3}]}
     calls.stop(5)

@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import random
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from service.errors import Trouble
 from service.payloads import Message
 from service.recording import Calls, Recorder, Settings, Start, decode_calls, encode_calls, event_of, event_text
 from service.replay import Lost, Recording, Taken
+from tests.waiting import wait_for
 
 STAMPS = st.integers(0, 1 << 60)
 SECOND = 1_000_000_000
@@ -82,10 +82,7 @@ class Desk:
 
     def written(self, check: Callable[[], bool]) -> None:
         """Wait for the writing thread to have done something."""
-        deadline = time.monotonic() + 20.0
-        while not check():
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        wait_for("the writing thread", check)
 
 
 def chunks(path: Path) -> list[bytes]:

@@ -17,6 +17,7 @@ import service.view
 from service.commands.view import DRAWN
 from service.relay import Sample
 from service.view import ALIVE_KEY, PAGES_MAX, Relay, make_app
+from tests.waiting import GIVE_UP_S
 
 Task = Callable[[Relay, TestClient], Awaitable[None]]  # type: ignore[type-arg]
 
@@ -25,7 +26,7 @@ def with_page(task: Task) -> None:
     async def run() -> None:
         relay = Relay(asyncio.get_running_loop())
         async with TestClient(TestServer(make_app(relay))) as client:
-            await asyncio.wait_for(task(relay, client), 20.0)
+            await asyncio.wait_for(task(relay, client), GIVE_UP_S)
 
     asyncio.run(run())
 
@@ -103,8 +104,12 @@ def test_the_number_of_pages_is_bounded() -> None:
             await client.ws_connect("/stream")
         assert refused.value.status == 503
         await sockets[0].close()
-        await asyncio.sleep(0.05)
-        again = await client.ws_connect("/stream")
+        again = None
+        while again is None:  # the server sees it a moment later
+            try:
+                again = await client.ws_connect("/stream")
+            except aiohttp.WSServerHandshakeError:
+                await asyncio.sleep(0.01)
         for socket in (*sockets[1:], again):
             await socket.close()
 

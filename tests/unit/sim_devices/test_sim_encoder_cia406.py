@@ -16,6 +16,7 @@ import pytest
 
 from sim_devices.device import F64, Frame, Mount
 from sim_devices.encoder_cia406 import FULL_RANGE, Cia406Encoder
+from tests.waiting import GIVE_UP_S, wait_for
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -386,7 +387,7 @@ def on_virtual_bus(*encoders: Cia406Encoder) -> Iterator[canopen.Network]:
     network.subscribe(0x700 + NODE, lambda *_: booted.set())
     thread.start()
     try:
-        assert booted.wait(5.0)
+        assert booted.wait(GIVE_UP_S)
         yield network
     finally:
         ended.set()
@@ -397,7 +398,9 @@ def on_virtual_bus(*encoders: Cia406Encoder) -> Iterator[canopen.Network]:
 
 def remote_node(network: canopen.Network, dictionary: canopen.ObjectDictionary) -> Any:
     """canopen's view of the node; its library is only partly typed."""
-    return network.add_node(canopen.RemoteNode(NODE, dictionary))
+    node: Any = network.add_node(canopen.RemoteNode(NODE, dictionary))
+    node.sdo.RESPONSE_TIMEOUT = GIVE_UP_S
+    return node
 
 
 def test_canopen_configures_reads_and_hears_it() -> None:
@@ -417,13 +420,10 @@ def test_canopen_configures_reads_and_hears_it() -> None:
         network.subscribe(0x280 + NODE, lambda *_: synced.set())
         node.nmt.state = "OPERATIONAL"
         network.sync.transmit()
-        assert synced.wait(1.0)
-        node.nmt.wait_for_heartbeat(1.0)
+        assert synced.wait(GIVE_UP_S)
+        node.nmt.wait_for_heartbeat(GIVE_UP_S)
         assert node.nmt.state == "OPERATIONAL"
-        deadline = time.monotonic() + 2.0
-        while len(heard) < 10 and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert len(heard) >= 10
+        wait_for("ten positions", lambda: len(heard) >= 10)
         assert heard == sorted(heard)
 
 
@@ -455,5 +455,5 @@ def test_canopen_remaps_a_pdo() -> None:
         node.tpdo[1].enabled = True
         node.tpdo.save()
         node.nmt.state = "OPERATIONAL"
-        assert node.tpdo[1].wait_for_reception(1.0) is not None
+        assert node.tpdo[1].wait_for_reception(GIVE_UP_S) is not None
         assert node.tpdo[1]["position"].raw == 4711

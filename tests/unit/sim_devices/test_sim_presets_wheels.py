@@ -17,6 +17,7 @@ from sim_devices.floor_plan import FloorPlan, Wall
 from sim_devices.presets import PRESETS, PresetError, Robot, emulate, for_log, hurry, preset, to_toml
 from sim_devices.robot import CommandedMotion, SimScene, Trajectory, twist
 from sim_devices.world import World
+from tests.waiting import GIVE_UP_S, wait_for
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -53,14 +54,20 @@ def stage(tmp_path: Path, *faults: str, **wheels: Any) -> tuple[Attachment, Robo
     return attachment, robot
 
 
-def ask(attachment: Attachment, port: serial.Serial, command: bytes, at_ns: int) -> bytes:
+def ask(robot: Robot, attachment: Attachment, port: serial.Serial, command: bytes, at_ns: int) -> bytes:
+    """What a device says within 60 of its milliseconds; a pty hands bytes on in its own time."""
+    (counters,) = (link.counters for link in robot.links.values() if str(getattr(link, "path", "")) == port.port)
+    received, sent = counters.received_bytes + len(command), counters.sent_bytes
     port.write(command)
+
+    def is_heard() -> bool:
+        attachment.service(at_ns)
+        return counters.received_bytes >= received
+
+    wait_for("the device to hear it", is_heard, every_s=0.001)
     for later_ns in range(0, 60 * MS, MS):
         attachment.service(at_ns + later_ns)
-    answer = b""
-    while chunk := port.read(4096):  # a pty hands bytes on in its own time
-        answer += chunk
-    return answer
+    return bytes(port.read(counters.sent_bytes - sent))
 
 
 @pytest.mark.parametrize(("fault", "left"), [("", 1.0), ("encoder:missed_counts=0.5(side=1)", 0.5)])
@@ -68,9 +75,9 @@ def test_arduino_board_on_a_pty(tmp_path: Path, fault: str, left: float) -> None
     attachment, robot = stage(tmp_path, *([fault] if fault else []), driver="arduino-bridge")
     try:
         attachment.service(0)
-        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=0.1) as port:
-            assert ask(attachment, port, b"b\r", 2 * SECOND) == b"57600\r\n"
-            counts = ask(attachment, port, b"e\r", 10 * SECOND).split()
+        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=GIVE_UP_S) as port:
+            assert ask(robot, attachment, port, b"b\r", 2 * SECOND) == b"57600\r\n"
+            counts = ask(robot, attachment, port, b"e\r", 10 * SECOND).split()
             assert int(counts[0]) == pytest.approx(left * TICKS, abs=2)
             assert int(counts[1]) == pytest.approx(-TICKS, abs=2)
     finally:
@@ -81,11 +88,11 @@ def test_roboclaw_on_a_pty(tmp_path: Path) -> None:
     attachment, robot = stage(tmp_path, driver="roboclaw", address=0x81)
     try:
         attachment.service(0)
-        with serial.Serial(robot.config["wheels"]["drive"]["port"], 115200, timeout=0.1) as port:
-            counts = ask(attachment, port, b"\x81\x4e", 10 * SECOND)
+        with serial.Serial(robot.config["wheels"]["drive"]["port"], 115200, timeout=GIVE_UP_S) as port:
+            counts = ask(robot, attachment, port, b"\x81\x4e", 10 * SECOND)
             assert int.from_bytes(counts[:4], "big") == pytest.approx(TICKS, abs=2)
             assert int.from_bytes(counts[4:8], "big", signed=True) == pytest.approx(-TICKS, abs=2)
-            assert ask(attachment, port, b"\x80\x4e", 11 * SECOND) == b""
+            assert ask(robot, attachment, port, b"\x80\x4e", 11 * SECOND) == b""
     finally:
         attachment.stop()
 
@@ -134,8 +141,8 @@ def test_hosts_commands_drive_a_robot_without_a_route(tmp_path: Path) -> None:
     robot = emulate(table, scene, attachment, tmp_path, plan=FaultPlan(["encoder:slip=0.0"]))
     try:
         attachment.service(0)
-        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=0.1) as port:
-            assert ask(attachment, port, b"m 20 20\r", 2 * SECOND) == b"OK\r\n"
+        with serial.Serial(robot.config["wheels"]["drive"]["port"], 57600, timeout=GIVE_UP_S) as port:
+            assert ask(robot, attachment, port, b"m 20 20\r", 2 * SECOND) == b"OK\r\n"
             for at_ns in range(2 * SECOND, 5 * SECOND, 20 * MS):
                 attachment.service(at_ns)
             # 600 ticks a second for two seconds
@@ -196,9 +203,9 @@ def test_wheels_and_sonars_on_one_port_are_one_board(tmp_path: Path) -> None:
         ports = [robot.config["wheels"]["drive"], robot.config["sonars"]["a"], robot.config["sonars"]["b"]]
         assert ports[0]["port"] == ports[1]["port"] != ports[2]["port"]
         attachment.service(0)
-        with serial.Serial(ports[0]["port"], 57600, timeout=0.1) as port:
-            assert ask(attachment, port, b"e\r", 2 * SECOND).count(b" ") == 1
-            assert ask(attachment, port, b"p 7\r", 3 * SECOND) == b"0\r\n"
+        with serial.Serial(ports[0]["port"], 57600, timeout=GIVE_UP_S) as port:
+            assert ask(robot, attachment, port, b"e\r", 2 * SECOND).count(b" ") == 1
+            assert ask(robot, attachment, port, b"p 7\r", 3 * SECOND) == b"0\r\n"
     finally:
         attachment.stop()
 

@@ -1,0 +1,129 @@
+"""How tests wait, find ports and measure time on a machine that may stop them for seconds (docs/testing.md).
+
+A wait ends when what it waits for is there; its limit only ends a run that would hang, so no good run ever meets it.
+What is asserted afterwards is what was waited for: one thread's work says nothing of another's.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import socket
+import termios
+import threading
+import time
+from array import array
+from collections.abc import Callable
+from typing import TypeVar
+
+GIVE_UP_S = 60.0
+"""A machine that does not come round in a minute is broken, or the program is."""
+
+START_S = 150.0
+"""For what may have to compile all kernels first, beside other tests."""
+
+T = TypeVar("T")
+
+
+def wait_for(what: str, ready: Callable[[], T | None], seconds: float = GIVE_UP_S, *, every_s: float = 0.01) -> T:
+    """What `ready` gives, as soon as that is true. AssertionError naming `what` if it never is."""
+    deadline = time.monotonic() + seconds
+    while not (result := ready()):
+        assert time.monotonic() < deadline, f"{what}: not within {seconds:g} s"
+        time.sleep(every_s)
+    return result
+
+
+# --- ports of the network -------------------------------------------------------------------------------------------
+
+_FIRST_PORT, _PORTS = 20_000, 10_000
+_reserved: list[socket.socket] = []
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A port of the loopback interface that nobody has, and that nobody else is given until this process ends.
+
+    Below those that the system gives to connections: one of those may be taken before whoever is told of it binds it.
+    Reserved by an abstract socket of that name, which all test processes of this machine respect.
+    """
+    begin = time.monotonic_ns() % _PORTS
+    for offset in range(_PORTS):
+        port = _FIRST_PORT + (begin + offset) % _PORTS
+        reservation = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            reservation.bind(f"\0umfeld-test-port-{port}")
+            with socket.socket(socket.AF_INET, kind) as probe:
+                probe.bind(("127.0.0.1", port))
+        except OSError:
+            reservation.close()
+            continue
+        _reserved.append(reservation)
+        return port
+    raise AssertionError("no port is free")
+
+
+def wait_for_input(descriptor: int, count: int) -> None:
+    """Until a terminal has so many bytes to read: a pty hands them on in its own time, and in pieces of its own."""
+    waiting = array("i", [0])
+
+    def there() -> bool:
+        fcntl.ioctl(descriptor, termios.FIONREAD, waiting)
+        return waiting[0] >= count
+
+    wait_for(f"{count} bytes of input", there, every_s=0.001)
+
+
+# --- time -----------------------------------------------------------------------------------------------------------
+
+
+class SteadyClock:
+    """Nanoseconds that all but stand still while this process is held up, so that real demands on time can be asked.
+
+    A thread of its own beats every few milliseconds; between two beats the clock goes no farther than MOST_NS, and
+    behind that a thousand times slower (so that two stamps still differ). Devices, drivers and judges that share it
+    are held up together: a process that is stopped for a second has lost 21 ms by it, not 1000. A program that lets
+    a device wait shows as ever, since the beat goes on meanwhile. A context manager; call it for the time.
+    """
+
+    BEAT_S = 0.004
+    MOST_NS = 20_000_000
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._beat_ns = time.monotonic_ns()
+        self._steady_ns = self._beat_ns
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="steady clock", daemon=True)
+        self._thread.start()
+
+    def __call__(self) -> int:
+        with self._lock:
+            return self._steady_ns + self._since_beat(time.monotonic_ns())
+
+    def __enter__(self) -> SteadyClock:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """End the thread; from then on the clock creeps."""
+        self._ending.set()
+        self._thread.join()
+
+    def _since_beat(self, now_ns: int) -> int:
+        passed_ns = now_ns - self._beat_ns
+        return min(passed_ns, self.MOST_NS) + max(passed_ns - self.MOST_NS, 0) // 1000
+
+    def _run(self) -> None:
+        while not self._ending.wait(self.BEAT_S):
+            with self._lock:
+                now_ns = time.monotonic_ns()
+                self._steady_ns += self._since_beat(now_ns)
+                self._beat_ns = now_ns
+
+
+def seconds_of(clock: Callable[[], int], work: Callable[[], object]) -> float:
+    """How long something takes by a clock."""
+    began_ns = clock()
+    work()
+    return (clock() - began_ns) / 1e9
