@@ -8,6 +8,8 @@ ifneq ($(wildcard ../shared/data/README.md),)
 export UMFELD_DATA ?= $(abspath ../shared/data)
 endif
 PYTEST := $(BIN)/python -m pytest
+# Patience with an index that is slow or resets connections; in the environment, so that builds of packages have it, too.
+PIP := PIP_RETRIES=8 PIP_DEFAULT_TIMEOUT=60 PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet
 JOBS ?= 2
 FUZZ_CASES ?= 300000
 FUZZ_ROUNDS ?= 10
@@ -22,7 +24,7 @@ venv: $(VENV)/.installed  ## The virtual environment with the command `umfeld`
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	for try in 1 2 3; do $(PIP) -c constraints.txt -e '.[dev]' && exit 0; sleep 10; done; exit 1
 	touch $@
 
 demo: venv  ## An emulated robot, the daemon and the live page; prints the address (Ctrl-C ends it)
