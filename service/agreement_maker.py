@@ -39,7 +39,8 @@ KINDS = {
     "door_is_walled": "a wall of map/lines stands across a door of map/rooms",
     "room_is_occupied": "a room of map/rooms is occupied in the grid where it was free",
     "place_is_occupied": "a region of map/topo has its middle in an occupied cell",
-    "way_is_blocked": "a passage of map/topo is occupied in the grid",
+    "way_is_blocked": "the way between two regions of map/topo that are joined is occupied in the grid",
+    "way_is_walled": "a wall of map/lines stands between two regions of map/topo that are joined",
 }
 Mark = tuple[str, int, int, str]
 
@@ -135,9 +136,15 @@ class AgreementMaker:
             centres = np.array([each.centre_m for each in regions.regions])
             verdict = agreement.points_in(grid, centres)
             yield _Judged("place_is_occupied", verdict, centres, lambda k: f"region {regions.regions[k].number}")
-            ends = np.array([each.ends_m for each in regions.passages]).reshape(-1, 2, 2)
+            centre_of = {each.number: each.centre_m for each in regions.regions}
+            middles = np.array([each.ends_m for each in regions.passages]).reshape(-1, 2, 2).mean(axis=1)
+            joined = [(centre_of[each.a], centre_of[each.b]) for each in regions.passages]
+            ways = np.array([(a, middle, b) for (a, b), middle in zip(joined, middles)]).reshape(-1, 3, 2)
             names = [f"passage {each.a} - {each.b}" for each in regions.passages]
-            yield _Judged("way_is_blocked", agreement.passages_in(grid, ends), ends.mean(axis=1), names.__getitem__)
+            yield _Judged("way_is_blocked", agreement.ways_in(grid, ways), middles, names.__getitem__)
+            if walls is not None:
+                verdict = agreement.crossed_ways(ways, walls.start_m, walls.end_m)
+                yield _Judged("way_is_walled", verdict, middles, names.__getitem__)
 
     def _count(self, judged: list[_Judged], stamp_ns: int) -> None:
         """Each disagreement counts once, when it begins; it is the same while it is about the same place."""

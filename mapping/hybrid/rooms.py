@@ -23,9 +23,18 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
 
-_END_M = 0.1  # around the end of a critical line: what stands there
+_CELL_M = (
+    0.05  # cells that the rules were found with: distances between cells' middles are brought to what they are there
+)
+_END_M = 0.125  # around the end of a critical line: what stands there
+_ENDS_APART_M = 0.1  # from a critical point: who else may say where its critical line ends
+_SLACK_CELLS = 0.25
+_CRACK_M, _CRACK_DEEP_M, _CRACK_THICK_M = 0.05, 0.25, 0.3  # wide, with so much wall on both sides, no thicker
+_LEAF_M = (0.55, 1.2)  # wide are doors' leaves
+_LEAF_FREE_M = 0.2  # from a leaf, on both sides, there is nothing
 _AROUND_M = 0.15  # of two cells with as much clearance the one with more around it is wider
 _BESIDE_M = (0.2, 1.0)  # from a cut: where the wall that it ends at must be free on both sides
+_STUB_TURNS = np.radians([0.0, -8.0, -4.0, 4.0, 8.0])
 _BEND_M = 0.2  # at a cut's other end: less free space than that beside it is a wall that goes straight on
 
 
@@ -36,7 +45,8 @@ class RoomRules:
     clutter_m: obstacles that stand alone and are no longer or wider are furniture and belong to the room around them.
     room_min_m2: smaller pieces join the neighbour they are most open to; alone they are no room.
     corner_m: how far beyond what a robot of the given width sweeps space belongs to the room: its corners.
-    keep, slack_m: a narrowing to no less than keep of the clearance beyond it, less slack_m, is no cut at all.
+    keep, slack_m: a narrowing to no less than keep of the clearance beyond it, less slack_m (and no less than a quarter
+    of a cell, which is how much cells make up), is no cut at all.
 
     The other cuts are judged by a sum. It rises with the clearance in the passage, as a share of the mean clearance of
     the piece where that is less (narrow_weight) and more (wide_weight), and with the share of the smaller piece's
@@ -127,22 +137,38 @@ def find_rooms(
         raise ValueError(f"width_m is a length, got {width_m}")
     if inside is not None and inside.shape != given.shape:
         raise ValueError(f"inside has the shape of the free cells, {given.shape}, got {inside.shape}")
-    open_space = without_clutter(np.pad(given, 1), round(rules.clutter_m / d))
+    padded, side = np.pad(given, 1), round(rules.clutter_m / d)
+    open_space = without_clutter(without_cracks(padded, d), side)
+    beside = without_clutter(padded, side) & ~open_space  # cracks, and what stands alone but for them
     field = DistanceField(~open_space)
     if width_m > 0.0:
         open_space = _enterable(field, width_m / d, rules.corner_m / d, None if inside is None else np.pad(inside, 1))
         field = DistanceField(~open_space)
     basin = np.empty(open_space.shape, dtype=np.int32)
     order = kernels.widest_first(field.squared, round(_AROUND_M / d))
-    count = kernels.flood(field.squared, order, rules.keep, rules.slack_m / d, basin)
+    slack = max(rules.slack_m / d, _SLACK_CELLS)
+    count = kernels.flood(field.squared, order, rules.keep, slack, _less_in_cells(d), basin)
     pieces = _Pieces(field, basin, count, d)
     pieces.join_small(rules.room_min_m2 / (d * d))
     pieces.measure_stubs(basin, rules.stub_most_m)
     pieces.join_unconvincing(rules)
     labels = _number_rooms(basin, pieces, rules.room_min_m2 / (d * d))
-    rooms = _describe(labels, field.squared, order, d)
     doors = tuple(door for door in find_doors(labels, field, d) if door.width_m - d >= width_m)
+    _take_in(labels, beside)
+    rooms = _describe(labels, field.squared, order, d)
     return RoomMap(d, np.ascontiguousarray(labels[1:-1, 1:-1]), rooms, doors)
+
+
+def without_cracks(free: Bools, cell_m: float) -> Bools:
+    """free (R, C) less cracks through thin walls along rows or columns, what a robot or a painter left out.
+
+    Else what is cut off by them stands alone, as clutter does. All of it where cells are larger than a crack is wide.
+    """
+    out = free.copy()
+    wide, deep, thick = (int(length / cell_m + 1e-6) for length in (_CRACK_M, _CRACK_DEEP_M, _CRACK_THICK_M))
+    kernels.close_cracks(free, wide, deep, thick, out)
+    kernels.close_cracks(np.ascontiguousarray(free.T), wide, deep, thick, out.T)
+    return out
 
 
 def without_clutter(free: Bools, side_cells: int) -> Bools:
@@ -182,15 +208,22 @@ def _enterable(field: DistanceField, width: float, corner: float, inside: Bools 
     return np.asarray(holds_middle[label])
 
 
+def _less_in_cells(cell_m: float) -> float:
+    """What distances between cells' middles, in cells, are too long by, beside those of cells of _CELL_M: from the
+    middle of a cell to the next obstacle's is a cell, to its edge half of one."""
+    return 0.5 - 0.5 * _CELL_M / cell_m
+
+
 @dataclass(slots=True)
 class _Cut:
-    """Between two pieces: clearance of the widest passage in cells, cells side by side, sharpness of its corners, and
-    how long a wall it ends at."""
+    """Between two pieces: clearance of the widest passage in cells, cells side by side, sharpness of its corners,
+    whether it ends at the leaf of an open door, and how long a wall it ends at."""
 
     clearance: float
     length: float
     blunt: float
     sharp: float
+    at_leaf: bool
     stub_m: float = 0.0
 
     def join(self, other: _Cut) -> None:
@@ -198,7 +231,7 @@ class _Cut:
         self.length += other.length
         if other.clearance > self.clearance:
             self.clearance, self.blunt, self.sharp = other.clearance, other.blunt, other.sharp
-            self.stub_m = other.stub_m
+            self.stub_m, self.at_leaf = other.stub_m, other.at_leaf
 
 
 class _Pieces:
@@ -207,6 +240,8 @@ class _Pieces:
     def __init__(self, field: DistanceField, basin: I32, count: int, resolution_m: float) -> None:
         self.area, self.clearance, self.outline = (np.zeros(count) for _ in range(3))
         kernels.measure_basins(basin, field.squared, self.area, self.clearance, self.outline)
+        less = _less_in_cells(resolution_m)
+        self.clearance -= less * self.area
         self.into = list(range(count))
         self.cuts: list[dict[int, _Cut]] = [{} for _ in range(count)]
         self._cell_m = resolution_m
@@ -214,11 +249,15 @@ class _Pieces:
         points, lengths, widest, first = _widest_contacts(self._contacts, count)
         ruled = np.zeros(basin.shape, dtype=np.int32)
         kernels.count_ruled(field.site, field.squared, ruled)
-        sharpness = np.empty((len(points), 2))
-        reach = max(round(_END_M / resolution_m), 1)
-        kernels.jambs(field.site, field.squared, ruled, widest[:, kernels.ROW :], first, reach, sharpness)
-        for (a, b, squared, _, _), length, (blunt, sharp) in zip(points.tolist(), lengths, sharpness.tolist()):
-            cut = _Cut(math.sqrt(squared), float(length), blunt, sharp)
+        sharpness = np.empty((len(points), 3))
+        apart, around = max(round(_ENDS_APART_M / resolution_m), 1), _END_M / resolution_m
+        at = widest[:, kernels.ROW :]
+        least, most, beside = (length / resolution_m for length in (*_LEAF_M, _LEAF_FREE_M))
+        layers = (field.site, field.squared)
+        lines = kernels.door_lines(*layers, at, first, apart, 0.8 * least, most)
+        kernels.jambs(*layers, ruled, at, first, apart, around, less, lines, least, most, beside, sharpness)
+        for (a, b, squared, _, _), length, (blunt, sharp, tips) in zip(points.tolist(), lengths, sharpness.tolist()):
+            cut = _Cut(math.sqrt(squared) - less, float(length), blunt, sharp, tips > 0.5)
             self.cuts[a][b] = cut
             self.cuts[b][a] = cut
 
@@ -252,9 +291,9 @@ class _Pieces:
         beside = np.arange(_BESIDE_M[0], _BESIDE_M[1] + 0.05, 0.1) / self._cell_m
         length = np.empty(len(pairs))
         most, bend = most_m / self._cell_m, _BEND_M / self._cell_m
-        kernels.stubs(basin, owner, cells[order], np.append(first, len(order)), beside, most, bend, length)
+        kernels.stubs(basin, owner, cells[order], np.append(first, len(order)), beside, _STUB_TURNS, most, bend, length)
         for (a, b), cells_long in zip(pairs.tolist(), length.tolist()):
-            self.cuts[a][b].stub_m = cells_long * self._cell_m
+            self.cuts[a][b].stub_m = 0.0 if self.cuts[a][b].at_leaf else cells_long * self._cell_m
 
     def join_unconvincing(self, rules: RoomRules) -> None:
         """Join pieces while the least convincing cut is no door."""
@@ -349,6 +388,22 @@ def _number_rooms(basin: I32, pieces: _Pieces, room_min_cells: float) -> I32:
     return basin
 
 
+def _take_in(labels: I32, more: Bools) -> None:
+    """Give what hangs together of more to the room it touches most, in place; what touches none, to none. Nothing of it
+    is at the border."""
+    cells = np.argwhere(more)
+    if not len(cells):
+        return
+    part = np.empty(labels.shape, dtype=np.int32)
+    kernels.connected(more, False, part)
+    own = part[cells[:, 0], cells[:, 1]]
+    touched = np.zeros((own.max() + 1, int(labels.max()) + 1), dtype=np.int64)
+    for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        np.add.at(touched, (own, labels[cells[:, 0] + down, cells[:, 1] + right]), 1)
+    touched[:, 0] = 0
+    labels[cells[:, 0], cells[:, 1]] = touched.argmax(axis=1)[own]
+
+
 def _describe(labels: I32, squared: I32, order: I32, d: float) -> tuple[Room, ...]:
     """Rooms of padded labels; cells are of the grid without padding."""
     area = np.bincount(labels.ravel())
@@ -376,9 +431,9 @@ def find_doors(labels: I32, field: DistanceField, resolution_m: float) -> tuple[
     order = np.lexsort((-found[:, kernels.SQUARED], at, found[:, kernels.UPPER], found[:, kernels.LOWER]))
     keys = np.stack((found[:, kernels.LOWER], found[:, kernels.UPPER], at), axis=-1)[order]
     first = np.flatnonzero(np.append(True, (np.diff(keys, axis=0) != 0).any(axis=1)))
-    doors = []
+    doors, apart = [], max(round(_ENDS_APART_M / resolution_m), 1)
     for a, b, _, row, col in found[order[first]].tolist():
-        r0, c0, r1, c1 = (int(v) - 1 for v in kernels.critical_line(field.site, field.squared, row, col, 2))
+        r0, c0, r1, c1 = (int(v) - 1 for v in kernels.critical_line(field.site, field.squared, row, col, apart))
         width_m = math.hypot(r1 - r0, c1 - c0) * resolution_m
         doors.append(Door(a, b, (row - 1, col - 1), ((r0, c0), (r1, c1)), width_m))
     return tuple(doors)

@@ -94,6 +94,41 @@ def boxes(label: Any, box: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
+def close_cracks(free: Any, wide: int, deep: int, thick: int, out: Any) -> None:
+    """Close cracks that run along columns through walls that run along rows, and (given transposed arrays) the others.
+
+    A crack is at most `wide` free cells in a row with at least `deep` obstacle cells on both sides, and no more than
+    `thick` such cells in a column: what is longer is a gap between two things, not a hole in one.  free: (R, C) is
+    read, out: (R, C) made False there.
+    """
+    rows, cols = free.shape
+    high = np.zeros(cols, dtype=np.int32)  # of the crack that ends in this row
+    mark = np.zeros(cols, dtype=np.bool_)
+    for r in range(rows + 1):
+        mark[:] = False
+        if r < rows:
+            wall, gap = 0, 0  # obstacle cells before the gap, cells of the gap
+            run = 0
+            for c in range(cols):
+                if free[r, c]:
+                    if run > 0:
+                        wall, gap = run, 0
+                        run = 0
+                    gap += 1
+                else:
+                    run += 1
+                    if run == deep and 0 < gap <= wide and wall >= deep:
+                        mark[c - deep + 1 - gap : c - deep + 1] = True
+        for c in range(cols):
+            if mark[c]:
+                high[c] += 1
+            else:
+                if 0 < high[c] <= thick:
+                    out[r - high[c] : r, c] = False
+                high[c] = 0
+
+
+@njit(cache=True, nogil=True)
 def sums_around(squared: Any, around: int) -> Any:
     """(R, C) int64: sum of the cells at most `around` rows and columns away, what is beyond the border 0."""
     rows, cols = squared.shape
@@ -157,12 +192,13 @@ def widest_first(squared: Any, around: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def flood(squared: Any, order: Any, keep: float, slack: float, basin: Any) -> Any:
+def flood(squared: Any, order: Any, keep: float, slack: float, less: float, basin: Any) -> Any:
     """Cut free space at its narrow places; how many basins there are. basin: (R, C) int32 out.
 
     Cells are taken by falling clearance. One that touches no basin begins one; one that touches two is where both
     meet, at the narrowest point of the widest way between them: the critical point of [Thr98]. They become one there
-    if that point is no narrower than keep * the lesser of the two greatest clearances - slack cells.
+    if that point is no narrower than keep * the lesser of the two greatest clearances - slack cells, all clearances
+    being distances less `less` cells.
     """
     rows, cols = squared.shape
     size = order.size
@@ -172,7 +208,7 @@ def flood(squared: Any, order: Any, keep: float, slack: float, basin: Any) -> An
     n = 0
     for i in range(size):
         r, c = order[i] // cols, order[i] % cols
-        clearance = np.sqrt(np.float32(squared[r, c]))
+        clearance = np.sqrt(np.float32(squared[r, c])) - np.float32(less)
         here: Any = -1  # the basin of all that met here
         mine: Any = -1  # the basin uphill, to which the cell goes
         steepest = np.int64(-1)
@@ -289,29 +325,127 @@ def critical_line(site: Any, squared: Any, r: Any, c: Any, reach: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def jambs(site: Any, squared: Any, ruled: Any, points: Any, first: Any, reach: int, sharpness: Any) -> None:
+def door_lines(site: Any, squared: Any, points: Any, first: Any, apart: int, least: float, most: float) -> Any:
+    """(D, 4) row, column, row, column of the ends of critical lines as long as a door is wide, one for each passage."""
+    lines = np.empty((first.size - 1, 4), dtype=np.int64)
+    n = 0
+    for i in range(first.size - 1):
+        p = (first[i] + first[i + 1]) // 2
+        line = critical_line(site, squared, np.int64(points[p, 0]), np.int64(points[p, 1]), apart)
+        if least <= math.hypot(line[2] - line[0], line[3] - line[1]) <= most:
+            lines[n, 0], lines[n, 1], lines[n, 2], lines[n, 3] = line
+            n += 1
+    return lines[:n]
+
+
+@njit(cache=True, nogil=True)
+def obstacle_near(squared: Any, row: float, col: float, around: int) -> bool:
+    """Whether there is one at most so many rows and columns away."""
+    rows, cols = squared.shape
+    r, c = math.floor(row + 0.5), math.floor(col + 0.5)
+    for rr in range(max(r - around, 0), min(r + around + 1, rows)):
+        for cc in range(max(c - around, 0), min(c + around + 1, cols)):
+            if squared[rr, cc] == 0:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def is_leaf(squared: Any, row: Any, col: Any, lines: Any, least: float, most: float, beside: float) -> bool:
+    """Whether an obstacle cell is the tip of a leaf that hangs at one of those openings and stands open.
+
+    lines: (D, 4) of door_lines: one end is the jamb, the other on the leaf. The hinge is where, from the tip through
+    the latter, the way back is as long as that on to the jamb: so long, `least` to `most`, is the leaf, and so wide the
+    opening. It stands open by 40 to 160 degrees, is free on both sides at `beside`, but for its ends, and behind its
+    hinge the wall goes on. All lengths in cells.
+    """
+    for k in range(lines.shape[0]):
+        for e in range(2):
+            jamb_down, jamb_right = float(lines[k, 2 * e] - row), float(lines[k, 2 * e + 1] - col)
+            down, right = float(lines[k, 2 - 2 * e] - row), float(lines[k, 3 - 2 * e] - col)
+            seen = math.hypot(down, right)
+            if seen < 1.0 or seen > 1.3 * most:
+                continue
+            down, right = down / seen, right / seen
+            ahead = jamb_down * down + jamb_right * right
+            if ahead <= 0.0:
+                continue
+            length = (jamb_down**2 + jamb_right**2) / (2.0 * ahead)
+            if not (least <= length <= most and 0.4 * length <= seen <= 1.3 * length):
+                continue
+            open_cos = (length - ahead) / length
+            if -0.94 <= open_cos <= 0.77 and _is_thin_wall(squared, row, col, down, right, length, beside):
+                behind_down = row + down * length + (down * length - jamb_down) * 0.75 * beside / length
+                behind_right = col + right * length + (right * length - jamb_right) * 0.75 * beside / length
+                if obstacle_near(squared, behind_down, behind_right, 1):
+                    return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _is_thin_wall(squared: Any, row: Any, col: Any, down: float, right: float, length: float, beside: float) -> bool:
+    """Whether there is one from (row, col) on in that direction, so long, and free at `beside` on both sides, from two
+    to seven tenths of it; nine of ten places have to be so."""
+    rows, cols = squared.shape
+    wall, thin, sides, steps = 0, 0, 0, math.ceil(length)
+    for i in range(steps + 1):
+        r, c = row + down * length * i / steps, col + right * length * i / steps
+        wall += obstacle_near(squared, r, c, 1)
+        if 2 * steps <= 10 * i <= 7 * steps:
+            for side in (-1, 1):
+                rr, cc = math.floor(r - side * beside * right + 0.5), math.floor(c + side * beside * down + 0.5)
+                sides += 1
+                thin += 0 <= rr < rows and 0 <= cc < cols and squared[rr, cc] > 0
+    return wall >= 0.9 * (steps + 1) and thin >= 0.9 * sides
+
+
+@njit(cache=True, nogil=True)
+def jambs(
+    site: Any,
+    squared: Any,
+    ruled: Any,
+    points: Any,
+    first: Any,
+    apart: int,
+    around: float,
+    less: float,
+    lines: Any,
+    least: float,
+    most: float,
+    beside: float,
+    sharpness: Any,
+) -> None:
     """What stands at the ends of critical lines.
 
     points: (K, 2) the critical points of passages, those of passage i, all equally wide, from first[i] to
-    first[i + 1].  reach: cells around an end that belong to it.  sharpness: (N, 2) out, means over a passage's cells:
-    cells that rule from the obstacle cells around each end, over the squared clearance: about nothing before a straight
-    wall, 0.8 before a corner of 90 degrees, 1.6 and more before the end of a wall; the lesser first.
+    first[i + 1].  apart: critical_line's reach.  around: half the side of a square around an end, in cells; what is in
+    it belongs to the end, of a cell at its edge a share.  less: of a distance, as in flood.  lines, least, most,
+    beside: as in is_leaf.  sharpness: (N, 3) out, means over a passage's cells: cells that rule from the obstacle cells
+    around each end, over the squared clearance: about nothing before a straight wall, 0.8 before a corner of 90
+    degrees, 1.6 and more before the end of a wall; the lesser first. Nothing before the tip of a door's leaf; last, how
+    many such tips there are.
     """
     rows, cols = site.shape
+    reach = math.ceil(around - 0.5)
     for i in range(first.size - 1):
-        sharpness[i, 0] = sharpness[i, 1] = 0.0
+        sharpness[i] = 0.0
         for p in range(first[i], first[i + 1]):
             r, c = np.int64(points[p, 0]), np.int64(points[p, 1])
-            line = critical_line(site, squared, r, c, reach)
+            line = critical_line(site, squared, r, c, apart)
+            clearance = math.sqrt(squared[r, c]) - less
             blunt, sharp = np.inf, 0.0
             for e in range(2):
                 row, col = line[2 * e], line[2 * e + 1]
-                n = 0
+                n = 0.0
                 for rr in range(max(row - reach, 0), min(row + reach + 1, rows)):
+                    down = min(around + 0.5 - abs(rr - row), 1.0)
                     for cc in range(max(col - reach, 0), min(col + reach + 1, cols)):
-                        n += ruled[rr, cc]
-                sharp = max(sharp, n / squared[r, c])
-                blunt = min(blunt, n / squared[r, c])
+                        n += ruled[rr, cc] * down * min(around + 0.5 - abs(cc - col), 1.0)
+                n /= clearance * clearance
+                if n > 0.0 and is_leaf(squared, row, col, lines, least, most, beside):
+                    n = 0.0
+                    sharpness[i, 2] += 1.0
+                sharp, blunt = max(sharp, n), min(blunt, n)
             sharpness[i, 0] += blunt
             sharpness[i, 1] += sharp
         sharpness[i] /= first[i + 1] - first[i]
@@ -350,18 +484,41 @@ def farthest(cells: Any, begin: Any, end: Any, r: Any, c: Any, middle: Any, reac
 
 
 @njit(cache=True, nogil=True)
-def stubs(basin: Any, owner: Any, cells: Any, first: Any, beside: Any, most: float, bend: float, length: Any) -> None:
-    """How long a wall that a cut ends at runs on in the cut's direction, free on both sides.
+def beyond(basin: Any, owner: Any, row: Any, col: Any, along: Any, cut: float, beside: Any, most: float) -> Any:
+    """What is free beyond the end (row, col) of a cut, so long, in the direction along (row, col).
+
+    On all lines beside it, on both sides, to at most `most`: how far it is free; how far on the better side without
+    leaving the piece there; how far it is free on half of the lines of the better side.
+    """
+    seen = np.empty(beside.size)
+    free, within, half = most, 0.0, 0.0
+    for side in (-1, 1):
+        own = most
+        for k in range(beside.size):  # from a quarter of the cut inside, lest the wall's rough end be hit
+            r = row - 0.25 * cut * along[0] - side * beside[k] * along[1]
+            c = col - 0.25 * cut * along[1] + side * beside[k] * along[0]
+            n, inside = walk(basin, owner, r, c, along, most + 0.25 * cut)
+            seen[k] = n - 0.25 * cut
+            own = min(own, inside - 0.25 * cut)
+        free, within, half = min(free, seen.min()), max(within, own), max(half, np.median(seen))
+    return free, within, half
+
+
+@njit(cache=True, nogil=True)
+def stubs(
+    basin: Any, owner: Any, cells: Any, first: Any, beside: Any, turns: Any, most: float, bend: float, length: Any
+) -> None:
+    """How long a wall that a cut ends at runs on in about the cut's direction, free on both sides.
 
     owner: (N,) the piece of each basin.  cells: (K, 3) row, column and squared clearance of the contacts of cut i, from
     first[i] to first[i + 1], widest first.  beside: (M,) how far from the cut, on each side of it and parallel with it,
-    is looked along, to at most `most` beyond its end.  length: (N,) out, cells, of the longer of both walls: as far as
-    it is free on all of these lines, on one side at least without leaving the piece there. 0 if at the other end it is
-    free by less than `bend` on half of the lines of either side: a wall that goes straight on, as of a corridor that
-    something juts out into.
+    is looked along, to at most `most` beyond its end.  turns: (T,) radians, by which the wall may stand otherwise than
+    the cut: cuts are crooked by as much, in other ways where a map lies otherwise.  length: (N,) out, cells, of the
+    longest of both walls in all these directions: as far as it is free on all of these lines, on one side at least
+    without leaving the piece there. 0 if at the other end it is free by less than `bend` on half of the lines of either
+    side: a wall that goes straight on, as of a corridor that something juts out into.
     """
-    free, within, turned = np.empty(2), np.empty(2), np.empty(2)
-    seen = np.empty(beside.size)
+    longest, turned = np.empty(2), np.empty(2)
     for i in range(first.size - 1):
         length[i] = 0.0
         begin, end = first[i], first[i + 1]
@@ -373,22 +530,18 @@ def stubs(basin: Any, owner: Any, cells: Any, first: Any, beside: Any, most: flo
             continue
         for e in range(2):
             tip, other = (a, b) if e == 0 else (b, a)
-            down, right = float(cells[tip, 0] - cells[other, 0]), float(cells[tip, 1] - cells[other, 1])
-            along = (down / cut, right / cut)
-            free[e], within[e], turned[e] = most, 0.0, 0.0
-            for side in (-1, 1):
-                own = most
-                for k in range(beside.size):  # from a quarter of the cut inside, lest the wall's rough end be hit
-                    r = cells[tip, 0] - 0.25 * down - side * beside[k] * along[1]
-                    c = cells[tip, 1] - 0.25 * right + side * beside[k] * along[0]
-                    n, inside = walk(basin, owner, r, c, along, most + 0.25 * cut)
-                    seen[k] = n - 0.25 * cut
-                    own = min(own, inside - 0.25 * cut)
-                free[e], within[e] = min(free[e], seen.min()), max(within[e], own)
-                turned[e] = max(turned[e], np.median(seen))
+            down, right = (cells[tip, 0] - cells[other, 0]) / cut, (cells[tip, 1] - cells[other, 1]) / cut
+            longest[e] = turned[e] = 0.0
+            for turn in turns:
+                c, s = math.cos(turn), math.sin(turn)
+                along = (c * down - s * right, s * down + c * right)
+                free, within, half = beyond(basin, owner, cells[tip, 0], cells[tip, 1], along, cut, beside, most)
+                longest[e] = max(longest[e], min(free, within))
+                if turn == 0.0:
+                    turned[e] = half
         for e in range(2):
             if turned[1 - e] >= bend:
-                length[i] = max(length[i], min(free[e], within[e]))
+                length[i] = max(length[i], longest[e])
 
 
 @njit(cache=True, nogil=True)

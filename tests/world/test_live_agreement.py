@@ -13,6 +13,7 @@ from service.line_maker import LineMaker
 from service.map_makers import MapMakers
 from service.outputs import DocumentOut, Output
 from service.room_maker import RoomMaker
+from service.topo_maker import TopoMaker
 from sim_devices.floor_plan import FloorPlan, Route, load_floor_plan
 from sim_devices.robot import follow
 from sim_devices.world import World
@@ -49,8 +50,9 @@ def documents(shut: bool) -> list[dict[str, Any]]:
         told.append({"key": output.key, "stamp_s": output.stamp_ns * 1e-9, **output.fields})
 
     lines, rooms = LineMaker(LineMap(), ["front"]), RoomMaker(clearance_m=0.2, period_ns=12_000_000_000)
-    checking = AgreementMaker(lines=lines, rooms=rooms, sources=["front"])
-    makers = MapMakers([lines, rooms, checking], offer, now_ns=lambda: 0)
+    topo = TopoMaker(period_ns=12_000_000_000)
+    checking = AgreementMaker(lines=lines, rooms=rooms, topo=topo, sources=["front"])
+    makers = MapMakers([lines, rooms, topo, checking], offer, now_ns=lambda: 0)
     start = driving.truth(0)
     robot(Pose2(start.x_m, start.y_m, start.yaw_rad), makers=makers).play(items)
     assert makers.counters()["makers.errors"] == 0
@@ -65,19 +67,23 @@ def of_kind(document: dict[str, Any], kind: str) -> dict[str, int]:
 def test_maps_of_one_still_flat_agree_all_the_way() -> None:
     told = [each for each in documents(False) if each["key"] == "map/agreement"]
     assert [each["where"] for each in told if each["disagreements"]] == []
-    assert of_kind(told[-1], "wall_is_free")["agree"] > 20
-    assert of_kind(told[-1], "door_is_blocked")["agree"] >= 1
+    agreed = {each["kind"]: each["agree"] for each in told[-1]["kinds"]}
+    assert agreed.keys() == KINDS.keys()
+    assert agreed["door_is_blocked"] == agreed["room_is_occupied"] == 6  # all doors and rooms of the flat
+    assert agreed["door_is_walled"] >= 4  # beside the others the line map has no wall at both jambs
+    assert min(agreed[kind] for kind in ("wall_is_free", "place_is_occupied", "way_is_blocked", "way_is_walled")) > 20
 
 
 def test_a_door_that_is_shut_is_told_until_the_rooms_know() -> None:
     """The line map has its leaf at once, the grid some seconds later; rooms come every twelve."""
     told = [each for each in documents(True) if each["key"] == "map/agreement"]
     assert not any(each["disagreements"] for each in told if each["stamp_s"] < SHUT_S)
-    for kind in ("door_is_walled", "door_is_blocked"):
+    kinds = ("door_is_walled", "door_is_blocked", "way_is_walled", "way_is_blocked")
+    for kind, what in zip(kinds, ("door", "door", "passage", "passage")):
         found = [each for each in told if of_kind(each, kind)["disagree"]]
         assert found, kind
         (where,) = (each for each in found[0]["where"] if each["kind"] == kind)
-        assert where["what"].startswith("door")
+        assert where["what"].startswith(what)
         assert abs(where["position"][0] - 8.0) < 0.3
         assert abs(where["position"][1] - 3.4) < 0.2
         assert found[-1]["stamp_s"] - found[0]["stamp_s"] < 15.0

@@ -106,15 +106,15 @@ def laps() -> list[Lap]:
     return driven
 
 
-def test_no_id_changes_its_room() -> None:
+def test_no_id_changes_its_room_and_each_room_is_one() -> None:
+    """A bug: between the sofa and the leaf of the glass door the living room was two."""
     meant: dict[int, str] = {}
     for k, lap in enumerate(laps()):
         for document in lap.documents:
-            assert len(document) <= len(set(document.values())) + 1, f"lap {k}: {document}"  # furniture parts one
+            assert len(document) == len(set(document.values())), f"lap {k}: {document}"
             for room_id, name in document.items():
                 assert meant.setdefault(room_id, name) == name, f"lap {k}: id {room_id} was {meant[room_id]}, is {name}"
-    assert set(meant.values()) == set(ROOMS)
-    assert len(meant) <= len(ROOMS) + 1
+    assert sorted(meant.values()) == sorted(ROOMS)
 
 
 def test_a_wing_gets_an_id_when_its_door_opens_and_all_others_keep_theirs() -> None:
@@ -124,10 +124,7 @@ def test_a_wing_gets_an_id_when_its_door_opens_and_all_others_keep_theirs() -> N
     assert before
     assert all("bedroom" not in document.values() for document in before)
     assert set(after.values()) == set(ROOMS)
-    assert len(after) <= len(ROOMS) + 1
-    for name in set(before[-1].values()):  # a room that furniture parts may be whole again: its elder id is told
-        assert after[min(room_id for room_id, each in before[-1].items() if each == name)] == name
-    assert all(after.get(room_id, name) == name for room_id, name in before[-1].items())
+    assert before[-1].items() <= after.items()
 
 
 def test_a_room_behind_a_shut_door_keeps_its_id() -> None:

@@ -9,11 +9,15 @@ from typing import Any
 import jsonschema
 import numpy as np
 
+from mapping.frames import IDENTITY
 from mapping.grids.patch import GridPatch
+from mapping.lines.line_map import LineMap, rows_of_ends
+from mapping.lines.lines import Lines
 from service import assemble, assemble_makers
 from service.agreement_maker import KINDS, AgreementMaker
 from service.commands.status import agreement_text
 from service.config import Config
+from service.line_maker import LineMaker
 from service.map_makers import MapView, Rect
 from service.outputs import DocumentOut
 from service.room_maker import RoomMaker
@@ -68,6 +72,7 @@ def test_a_shut_door_counts_once_and_heals_when_rooms_and_regions_catch_up() -> 
     assert kinds(shut)["door_is_blocked"] == (1, 1, 0)
     assert kinds(shut)["place_is_occupied"] == (1, 1, 0)  # the region in the doorway
     assert kinds(shut)["room_is_occupied"] == (2, 2, 0)  # each has a part of the doorway
+    assert kinds(shut)["way_is_blocked"] == (2, 2, 0)  # into that region and out of it
     assert {each["what"] for each in shut["where"]} >= {"door 1 - 2"}
     assert "door 1 - 2" in agreement_text(shut)
     assert told(maker, view(house(door=False))) is None  # nothing new
@@ -81,6 +86,37 @@ def test_a_shut_door_counts_once_and_heals_when_rooms_and_regions_catch_up() -> 
     assert agreement_text(healed).startswith("agree")
     maker.restore(())
     assert maker.changed_tiles() == []
+
+
+def test_every_kind_can_disagree_and_all_agree_on_one_house() -> None:
+    """A check that can only say yes, or never says anything, is none."""
+    rooms, topo, lines = RoomMaker(settle_turns=1), TopoMaker(smooth_m=0.2), LineMaker(LineMap(), ["front"])
+    maker = AgreementMaker(lines=lines, rooms=rooms, topo=topo)
+    rooms.make(view(house()))
+    topo.make(view(house()))
+    jambs = [[5.5, 0.6, 5.5, 2.5], [5.5, 3.5, 5.5, 5.4]]
+    with_lines(lines, jambs)
+    agreed = told(maker, view(house()))
+    assert agreed is not None
+    assert agreed["disagreements"] == 0
+    assert {each["kind"] for each in agreed["kinds"] if each["agree"]} == set(KINDS)
+    with_lines(lines, [*jambs, [5.5, 2.5, 5.5, 3.5], [2.0, 1.0, 2.0, 4.0]])
+    walled = told(maker, view(house(), changed=False))
+    blocked = told(maker, view(house(door=False)))
+    seen = {each["kind"] for document in (walled, blocked) if document for each in document["where"]}
+    assert seen == set(KINDS)
+    assert {kind for kind, (now, _, _) in kinds(walled).items() if now} == {
+        "wall_is_free", "door_is_walled", "way_is_walled",
+    }  # fmt: skip
+
+
+def with_lines(maker: LineMaker, ends_m: list[list[float]]) -> None:
+    """Put these walls (x, y, x, y) into its map, as if they had been seen often."""
+    ends, often = np.array(ends_m), np.full(len(ends_m), 50.0)
+    rows = rows_of_ends(ends[:, :2], ends[:, 2:], often, often, np.full(len(ends), 0.01))
+    line_map = LineMap()
+    line_map.insert(Lines(rows, np.full((len(rows), 2), -1, dtype=np.int64)), IDENTITY)
+    maker.restore([(0, 0, line_map.to_bytes())])
 
 
 def test_large_maps_are_compared_less_often() -> None:
