@@ -83,7 +83,7 @@ class Line(Protocol):
 
 
 def _hokuyo(data: bytes) -> Identity | None:
-    from drivers.scip import ScipReplies, model_name, text_fields
+    from drivers.scip import ScipReplies, text_fields
 
     for reply in ScipReplies().feed(data[max(data.find(b"VV"), 0) :], 0):
         if reply.echo.startswith(b"VV") and reply.status in ("00", "0"):
@@ -91,9 +91,18 @@ def _hokuyo(data: bytes) -> Identity | None:
                 fields = text_fields(reply)
             except FrameError:
                 continue
-            model = model_name(fields.get("PROD", ""))
-            return Identity(fields.get("VEND", ""), model, fields.get("SERI", ""), fields.get("FIRM", ""))
-    return None
+            return _hokuyo_named(fields)
+    old = re.search(rb"V\n0\n((?:[A-Z]{4}:[^\n]*\n)*SERI:[^\n]*\n)", data)  # SCIP 1.1: without sums
+    if old is None:
+        return None
+    return _hokuyo_named(dict(line.split(":", 1) for line in old[1].decode("ascii", "replace").splitlines()))
+
+
+def _hokuyo_named(fields: dict[str, str]) -> Identity:
+    from drivers.scip import model_name
+
+    model = model_name(fields.get("PROD", ""))
+    return Identity(fields.get("VEND", ""), model, fields.get("SERI", ""), fields.get("FIRM", ""))
 
 
 def _rplidar(data: bytes) -> Identity | None:
@@ -181,7 +190,7 @@ PROBES = (
     Probe("ldrobot", "lasers", (230400,), (), _ldrobot),
     Probe("maxbotix", "sonars", (9600,), (), _maxbotix, 0.9),
     Probe("mavlink", "wheels", (57600, 115200), (), _mavlink, 1.1),
-    Probe("hokuyo", "lasers", (115200, 19200, 57600, 38400), (b"VV\n",), _hokuyo),
+    Probe("hokuyo", "lasers", (115200, 19200, 57600, 38400), (b"VV\nV\n",), _hokuyo),
     Probe("sick_lms2xx", "lasers", (9600, 38400, 19200, 500000), (bytes.fromhex("020001003a1e12"),), _sick, 0.5),
     Probe("rplidar", "lasers", (115200, 256000), (b"\xa5\x25", b"\xa5\x50"), _rplidar),
     Probe("usboard-serial", "sonars", (19200,), (bytes(8),), _usboard),

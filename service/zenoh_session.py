@@ -300,7 +300,10 @@ class Client:
         if len(bases) == 1:
             return bases[0]
         if not bases:
-            raise NoDaemon(f"no daemon is alive at {self.endpoint}: start one with `umfeld run`")
+            raise NoDaemon(
+                f"no daemon is alive at {self.endpoint}: start one with `umfeld run`; after an update it answers only "
+                "when its kernels are compiled, about a minute later"
+            )
         names = ", ".join(found.removeprefix("robots/") for found in bases)
         raise NoDaemon(f"several robots answer at {self.endpoint}: choose one with --robot ({names})")
 

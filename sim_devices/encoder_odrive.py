@@ -6,6 +6,7 @@ Source: ODrive's protocol pages and message descriptions (DBC) of 0.5.6 and 0.6.
     01 heartbeat, 100 ms    09 encoder estimates, 10 ms: f32 revolutions, f32 revolutions/s
     0A counts (0.5.x, when asked)    07 axis state    0B-0E modes, position, velocity, torque    0F limits
     03 errors    14 Iq    16 reboot    17 bus voltage and current    18 clear errors    19 set position
+    06 address (0.6.x): node, serial number; asked of all by node 3F    04, 05 values of its tree (0.6.x), by number
 
 Heartbeat: u32 axis error, u8 state, then 0.5.x: motor, encoder and controller error flags, bit 7 of the last byte says
 trajectory done; 0.6.x: procedure result, trajectory done, 0.
@@ -13,10 +14,12 @@ trajectory done; 0.6.x: procedure result, trajectory done, 0.
 Habits kept: velocity moves the wheel in closed loop only; a calibration takes seconds and ends in idle; positions are
 32-bit floats, so their steps grow with the way; the estimates start at 0 with every start and reboot (incremental
 encoder); an error disarms. Commands longer than needed are taken; of shorter ones the missing bytes count as 0 (hosts
-in use send the axis state as one byte).
+in use send the axis state as one byte). A board whose node id another one is given has none (3F): it answers who asks
+for addresses and says nothing else. An id that was not saved is forgotten in a reboot.
 
 Assumed: torque mode moves nothing; a target position is reached at the velocity limit; closed loop is entered without a
-calibration before, as a board with stored calibration does; 0.6.x sends what `cyclic_ms` names besides.
+calibration before, as a board with stored calibration does; 0.6.x sends what `cyclic_ms` names besides. Which value of
+the tree has which number depends on the firmware: each number reads 0 until it is written, and then what was written.
 """
 
 from __future__ import annotations
@@ -36,7 +39,11 @@ VELOCITY_CONTROL, POSITION_CONTROL = 2, 3
 BOOT_NS = 300 * MILLISECOND_NS
 SUCCESS, BUSY, CANCELLED = 0, 1, 2
 INVALID_STATE = 0x01
+EVERYBODY = 0x3F  # as address; as a node's own: none
+TREE_READ, TREE_WRITE = 0, 1
+SAVE, ERASE = 1, 2  # of a reboot
 ESTOP_REQUESTED = 0x4000
+TREE, TREE_ANSWER = 0x04, 0x05  # 0.6.x; errors of encoder and sensorless estimator in 0.5.x
 FAILED_PARTS = (0x40, 0x100, 0x200)  # bits of a 0.5.x axis error: motor, encoder, controller
 (
     VERSION, HEARTBEAT, ESTOP, ERROR, ENCODER_ERROR, SENSORLESS_ERROR, ADDRESS, STATE, _, ESTIMATES, COUNTS, MODES, POS,
@@ -51,6 +58,7 @@ class ODriveAxis:
     wheel: what its motor turns; one of its turns is `gear` turns of the motor.  cpr: counts of the encoder a motor turn
     (its sign is the wheel's business).  sign: -1 for a motor mounted the other way round.  generation: "0.5" or "0.6".
     start_turns: what the position reads at power-on.  cyclic_ms: periods of messages sent unasked, by command.
+    serial: 48 bits; None makes one of the node id.
     """
 
     fault_family = "encoder"
@@ -67,7 +75,7 @@ class ODriveAxis:
         start_turns: float = 0.0,
         cyclic_ms: Mapping[int, int] | None = None,
         bus_v: float = 24.0,
-        serial: int = 0x3A5B7C9D1E2F,
+        serial: int | None = None,
     ) -> None:
         if not 0 <= node <= 0x3E:
             raise ValueError("an ODrive has a node id from 0 to 62")
@@ -87,7 +95,9 @@ class ODriveAxis:
             for command, period in ({HEARTBEAT: 100, ESTIMATES: 10} | dict(cyclic_ms or {})).items()
             if period
         }
-        self._serial = serial
+        self._serial = 0x3A5B7C9D1E00 + node if serial is None else serial
+        self._saved_node = node
+        self._tree: dict[int, bytes] = {}
         self._powered = False
         self._begin(0)
 
@@ -166,7 +176,8 @@ class ODriveAxis:
             for command, due_ns in sorted(self._due_ns.items()):
                 if due_ns == at_ns:
                     stale = now_ns - at_ns > SECOND_NS
-                    out.append(self._frame(command, self._value(command, now_ns if stale else at_ns)))
+                    if self.node != EVERYBODY:
+                        out.append(self._frame(command, self._value(command, now_ns if stale else at_ns)))
                     self._due_ns[command] = (now_ns if stale else at_ns) + self._cyclic_ns[command]
 
     def _enter(self, state: int, result: int) -> None:
@@ -208,7 +219,7 @@ class ODriveAxis:
         return Frame(self.node << 5 | command, data)
 
     def _hear(self, frame: Frame, now_ns: int, out: list[Frame]) -> None:
-        if frame.extended or frame.can_id >> 5 not in (self.node, 0x3F):
+        if frame.extended or frame.can_id >> 5 not in (self.node, EVERYBODY):
             return
         command = frame.can_id & 0x1F
         if frame.remote or not frame.data:
@@ -216,7 +227,9 @@ class ODriveAxis:
             if value:
                 out.append(self._frame(command, value))
                 return
-        if not frame.remote:
+        if not frame.remote and command == TREE and self.is_new:
+            out += self._look_up(frame.data)
+        elif not frame.remote:
             self._obey(command, frame.data, now_ns)
 
     def _value(self, command: int, now_ns: int) -> bytes:
@@ -273,7 +286,7 @@ class ODriveAxis:
         if command == ESTOP:
             self._fail(ESTOP_REQUESTED, now_ns)
         elif command == REBOOT:
-            self.power_on(now_ns)
+            self._reboot(data[0] if data else 0, now_ns)
         elif command == CLEAR:
             self._clear()
         elif command == STATE and len(data) >= 4:
@@ -290,12 +303,35 @@ class ODriveAxis:
         elif command in (POS, VEL) and len(data) >= 4 and self.state == CLOSED_LOOP:
             self._move(command, struct.unpack("<f", data[:4])[0], now_ns)
 
+    def _reboot(self, how: int, now_ns: int) -> None:
+        """Saves its node id, or forgets it with all else that was saved, or goes back to the saved one."""
+        if self.is_new:
+            if how == SAVE:
+                self._saved_node = self.node
+            elif how == ERASE:
+                self._saved_node, self._tree = EVERYBODY, {}
+            self.node = self._saved_node
+        self.power_on(now_ns)
+
     def _take_address(self, data: bytes) -> None:
-        """A new node id; 0.6.x takes it if the serial number fits."""
+        """A new node id; 0.6.x takes it if the serial number fits, and gives up its own to another board."""
         if self.is_new and data[1:7] not in (b"", self._serial.to_bytes(6, "little")):
-            return
-        if data[0] <= 0x3E:
+            if data[0] == self.node:
+                self.node = EVERYBODY
+        elif data[0] < EVERYBODY or (self.is_new and data[0] == EVERYBODY):
             self.node = data[0]
+
+    def _look_up(self, data: bytes) -> list[Frame]:
+        """A value of the tree, read or written: which, its number, 0, its bytes."""
+        if len(data) < 4:
+            return []
+        what, number = data[0], int.from_bytes(data[1:3], "little")
+        if what == TREE_WRITE:
+            self._tree[number] = data[4:].ljust(4, b"\0")
+            return []
+        if what != TREE_READ:
+            return []
+        return [self._frame(TREE_ANSWER, bytes((0, *data[1:3], 0)) + self._tree.get(number, bytes(4)))]
 
     def _move(self, command: int, target: float, now_ns: int) -> None:
         if not abs(target) < 1e9:  # not a number, or none a motor could follow

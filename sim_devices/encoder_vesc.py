@@ -1,11 +1,16 @@
 """A VESC motor controller on CAN: status frames of one motor, sent by itself, and the commands that drive it.
 
-Source: vedderb/bldc, comm_can.c and datatypes.h; big-endian, 29-bit id = packet << 8 | controller id.
+Source: vedderb/bldc, comm_can.c, commands.c and datatypes.h; big-endian, 29-bit id = packet << 8 | controller id.
 
      9 status    i32 ERPM, i16 current * 10, i16 duty * 1000      14, 15  amp, watt hours * 1e4: i32 used, i32 charged
     16 status 4  i16 FET temp * 10, i16 motor temp * 10, i16 input current * 10, i16 position * 50
     27 status 5  i32 tachometer, i16 input voltage * 10, i16 0    58  status 6: three inputs and PPM, i16 * 1000
      0 duty * 1e5, 1 current, 2 brake, 3 ERPM: i32                17  ping [own id] -> 18 pong
+     8 a message of its serial protocol, up to 6 bytes: [asker's id, how to answer, message]
+     5 a longer one in parts: [offset, up to 7 bytes], then 7: [own id, 1, u16 length, CRC-16]
+
+Of the serial protocol it answers what hosts on CAN ask: firmware version (0), values (4) and chosen values (50); and
+obeys duty, current, brake and ERPM (5 to 8).
 
 Habits kept: the tachometer counts six steps for each electrical turn and is signed 32 bits, 0 after power-on; commands
 hold for a second, then the motor is released.
@@ -19,12 +24,19 @@ import struct
 from collections.abc import Mapping, Sequence
 from math import floor
 
+from sim_devices.checksums import crc16_ccitt
 from sim_devices.device import Frame
 from sim_devices.wheel import Undo, Wheel, signed
 from sim_devices.wire import SECOND_NS
 
 STATUS, STATUS_2, STATUS_3, STATUS_4, STATUS_5, STATUS_6 = 9, 14, 15, 16, 27, 58
 SET_DUTY, SET_CURRENT, SET_BRAKE, SET_RPM, PING, PONG = 0, 1, 2, 3, 17, 18
+FILL_BUFFER, PROCESS_BUFFER, PROCESS_SHORT = 5, 7, 8
+ANSWER_TO_ASKER = 0  # other ways: none, or to whom it was passed on from
+COMM_VERSION, COMM_VALUES, COMM_CHOSEN_VALUES = 0, 4, 50
+COMM_SET_DUTY, COMM_SET_CURRENT, COMM_SET_BRAKE, COMM_SET_RPM = 5, 6, 7, 8
+FIRMWARE = (6, 2)
+HARDWARE = b"60\0"
 STEPS_PER_ELECTRICAL_TURN = 6
 BOOT_NS = SECOND_NS // 2
 HOLD_NS = SECOND_NS
@@ -146,10 +158,54 @@ class Vesc:
         if packet == PING and frame.data:
             out.append(Frame(PONG << 8 | frame.data[0], bytes((self.controller, 0)), extended=True))
         elif packet in (SET_DUTY, SET_CURRENT, SET_BRAKE, SET_RPM) and len(frame.data) >= 4:
-            value = struct.unpack(">i", frame.data[:4])[0]
-            erpm = {SET_DUTY: value / 1e5 * self._top_erpm, SET_RPM: float(value)}.get(packet, 0.0)
-            self._drive(max(-self._top_erpm, min(self._top_erpm, erpm)), now_ns)
-            self._release_ns = now_ns + HOLD_NS
+            self._obey(packet, frame.data, now_ns)
+        elif packet == PROCESS_SHORT and len(frame.data) >= 3:
+            self._take_message(frame.data[0], frame.data[1], frame.data[2], frame.data[3:], now_ns, out)
+
+    def _obey(self, packet: int, data: bytes, now_ns: int) -> None:
+        value = struct.unpack(">i", data[:4])[0]
+        erpm = {SET_DUTY: value / 1e5 * self._top_erpm, SET_RPM: float(value)}.get(packet, 0.0)
+        self._drive(max(-self._top_erpm, min(self._top_erpm, erpm)), now_ns)
+        self._release_ns = now_ns + HOLD_NS
+
+    def _take_message(self, asker: int, way: int, kind: int, data: bytes, now_ns: int, out: list[Frame]) -> None:
+        """A message of the serial protocol that came over CAN."""
+        if COMM_SET_DUTY <= kind <= COMM_SET_RPM and len(data) >= 4:
+            self._obey(kind - COMM_SET_DUTY + SET_DUTY, data, now_ns)
+        elif way == ANSWER_TO_ASKER:
+            if kind == COMM_VERSION:
+                identity = self.controller.to_bytes(12, "big")
+                flags, name, code = bytes(8), b"\0", bytes(4)
+                self._answer(asker, bytes((kind, *FIRMWARE)) + HARDWARE + identity + flags + name + code, out)
+            elif kind == COMM_VALUES:
+                self._answer(asker, bytes((kind,)) + self._values((1 << 32) - 1, now_ns), out)
+            elif kind == COMM_CHOSEN_VALUES and len(data) >= 4:
+                chosen = int.from_bytes(data[:4], "big")
+                self._answer(asker, bytes((kind,)) + data[:4] + self._values(chosen, now_ns), out)
+
+    def _answer(self, asker: int, message: bytes, out: list[Frame]) -> None:
+        """In parts of seven bytes; none of its answers is longer than the 255 that these can number."""
+        for at in range(0, len(message), 7):
+            part = bytes((at,)) + message[at : at + 7]
+            out.append(Frame(FILL_BUFFER << 8 | asker, part, extended=True))
+        end = struct.pack(">BBHH", self.controller, 1, len(message), crc16_ccitt(message))
+        out.append(Frame(PROCESS_BUFFER << 8 | asker, end, extended=True))
+
+    def _values(self, chosen: int, now_ns: int) -> bytes:
+        """The values whose bits are set, in order."""
+        tachometer = signed(self.tachometer(now_ns), 32)
+        duty = max(-1000, min(1000, round(1000.0 * self._erpm(now_ns) / self._top_erpm)))
+        position = round(1e6 * (self.wheel.turns(now_ns) * self._electrical * 360.0 % 360.0))
+        values: tuple[tuple[str, tuple[int, ...]], ...] = (
+            ("h", (300,)), ("h", (250,)),  # temperatures
+            ("i", (0,)), ("i", (0,)), ("i", (0,)), ("i", (0,)),  # currents
+            ("h", (duty,)), ("i", (self._erpm(now_ns),)), ("h", (round(10.0 * self.input_v),)),
+            ("i", (0,)), ("i", (0,)), ("i", (0,)), ("i", (0,)),  # amp and watt hours
+            ("i", (tachometer,)), ("i", (abs(tachometer),)), ("B", (0,)),  # fault
+            ("i", (position,)), ("B", (self.controller,)), ("3h", (300, 300, 300)),
+            ("i", (0,)), ("i", (0,)), ("B", (0,)),  # voltages, status
+        )  # fmt: skip
+        return b"".join(struct.pack(">" + form, *told) for k, (form, told) in enumerate(values) if chosen >> k & 1)
 
     def _drive(self, erpm: float, now_ns: int) -> None:
         self._release_ns = None

@@ -20,6 +20,7 @@ What this emulator does that a naive one would not:
 - Before the motor is up to speed streams are accepted and wait; GD is held back until a first scan exists.
 - RB twice: the answers still leave, then the device is deaf for half a second and starts from scratch.
 - One that starts in SCIP 1.1 answers V, G, L and S of that version until it is sent SCIP2.0.
+- Commands that come together are answered a millisecond apart (TM at once), so that a host reads one reply at a time.
 - An empty line is not answered. A second measuring command replaces the stream that runs.
 - Assumed, the papers being silent: distances past 4095 mm are clipped in MS and GS; a start before AMIN is allowed and
   gives "not measurable"; HD, HE, ND and NE are unknown commands on these models (0E).
@@ -51,6 +52,8 @@ WAKING = frozenset((b"BM", b"MD", b"MS", b"ME", b"GD", b"GS", b"GE"))
 ALWAYS_OBEYED = frozenset((b"TM", b"QT", b"RS", b"RT", b"%ST"))  # in time mode, too
 REBOOT_S = 0.5
 REBOOT_WINDOW_NS = SECOND_NS
+COMMAND_NS = 1_000_000
+BACKLOG_NS = 50_000_000
 MAX_RANGE_2_CHARS = 4095
 
 
@@ -403,6 +406,7 @@ class HokuyoLaser:
         self._reboot_asked_ns: int | None = None
         self._rebooting = False
         self._last_command = b""
+        self._busy_ns = now_ns  # with commands
 
     def set_clock_drift(self, ppm: float, now_ns: int) -> None:
         """Let the clock run so much too fast from now on; it does not jump."""
@@ -448,7 +452,13 @@ class HokuyoLaser:
 
     # -- commands -----------------------------------------------------------------------------------------------------
 
+    def _ready(self, now_ns: int) -> int:
+        """When a reply begins to leave."""
+        return max(now_ns, self._busy_ns - COMMAND_NS)
+
     def _obey(self, line: bytes, now_ns: int) -> None:
+        if line[:2] != b"TM":
+            self._busy_ns = min(max(now_ns, self._busy_ns), now_ns + BACKLOG_NS) + COMMAND_NS
         if self._scip1:
             self._obey_scip1(line, now_ns)
             return
@@ -491,10 +501,10 @@ class HokuyoLaser:
                 self._scip1 = False
                 self._answer_scip1(line, b"", now_ns)
             case _:
-                self._wire.send(line + b"\nE\n\n", now_ns)
+                self._wire.send(line + b"\nE\n\n", self._ready(now_ns))
 
     def _answer_scip1(self, echo: bytes, lines: bytes, now_ns: int, rate_after_bps: int | None = None) -> None:
-        self._wire.send(echo + b"\n0\n" + lines + b"\n", now_ns, rate_after_bps)
+        self._wire.send(echo + b"\n0\n" + lines + b"\n", self._ready(now_ns), rate_after_bps)
 
     def _scan_scip1(self, line: bytes, now_ns: int) -> None:
         """`G` start end cluster: two characters a value, 64 to a line. The beam is on from power-on."""
@@ -504,7 +514,7 @@ class HokuyoLaser:
             newest -= 1
         fits = start is not None and end is not None and start <= end <= self.profile.last_accepted_step
         if start is None or end is None or cluster is None or not fits or self._dark or newest < 0:
-            self._wire.send(line + b"\nE\n\n", now_ns)
+            self._wire.send(line + b"\nE\n\n", self._ready(now_ns))
             return
         ranges_mm, intensity = self._measure(start, end, self._turn_start_ns(newest))
         ranges_mm, _ = self._clustered(ranges_mm, intensity, max(1, cluster))
@@ -514,7 +524,7 @@ class HokuyoLaser:
 
     def _answer(self, echo: bytes, status: str, now_ns: int, lines: bytes = b"") -> None:
         reply = echo + b"\n" + sealed(status.encode("ascii")) + lines + b"\n"
-        self._wire.send(reply, now_ns, whole=self.link == "tcp")  # TCP is given whole replies
+        self._wire.send(reply, self._ready(now_ns), whole=self.link == "tcp")  # TCP is given whole replies
 
     def _sized(self, command: bytes, free: bytes, length: int, now_ns: int) -> bool:
         """Whether a command is as long as it must be; refuses it otherwise."""
@@ -608,7 +618,7 @@ class HokuyoLaser:
             self._forget(now_ns)
             self._set_speed(0, now_ns)
             back_bps = self._base_rate_bps if self.link == "rs232" else None
-            self._wire.send(command + free + b"\n" + sealed(b"00") + b"\n", now_ns, back_bps)
+            self._wire.send(command + free + b"\n" + sealed(b"00") + b"\n", self._ready(now_ns), back_bps)
 
     def _partial_reset(self, command: bytes, free: bytes, now_ns: int) -> None:
         """RT of the younger models: like RS, but motor speed and bit rate stay."""
@@ -663,7 +673,7 @@ class HokuyoLaser:
         elif rate_bps == self._wire.rate_bps:
             self._answer(echo, "03", now_ns)
         else:
-            self._wire.send(echo + b"\n" + sealed(b"00") + b"\n", now_ns, rate_bps)
+            self._wire.send(echo + b"\n" + sealed(b"00") + b"\n", self._ready(now_ns), rate_bps)
 
     def _motor_speed(self, command: bytes, free: bytes, now_ns: int) -> None:
         echo = command + free

@@ -122,7 +122,7 @@ class LdLidar:
             self._take(received, now_ns)
         while self._done_ns(self._next_packet) <= now_ns:
             if self._told_share:
-                self._wire.send(self._packet(self._next_packet), self._done_ns(self._next_packet))
+                self._wire.send(self._packet(self._next_packet), self._done_ns(self._next_packet), whole=True)
             self._next_packet += 1
         out = self._wire.leave_by(now_ns)
         return out if fits else garbled(out, self._random)

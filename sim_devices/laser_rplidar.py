@@ -318,7 +318,7 @@ class RpLidar:
 
     def _answer(self, kind: int, body: bytes, now_ns: int) -> None:
         head = struct.pack("<BBIB", START, 0x5A, len(body), kind)
-        self._wire.send(head + body, now_ns + REPLY_NS)
+        self._wire.send(head + body, now_ns + REPLY_NS, whole=True)
 
     def _tell_boot(self) -> None:
         self._booted = True
@@ -403,7 +403,7 @@ class RpLidar:
         if self.health == HEALTH_ERROR:
             return
         size = 84 if mode.answer == ANSWER_CAPSULES else 5
-        self._wire.send(struct.pack("<BBIB", START, 0x5A, size | REPEATED, mode.answer), now_ns + REPLY_NS)
+        self._wire.send(struct.pack("<BBIB", START, 0x5A, size | REPEATED, mode.answer), now_ns + REPLY_NS, whole=True)
         self._scan = _Scan(mode, forced)
         self._await_motor(self._scan, now_ns + REPLY_NS)
 
@@ -434,9 +434,9 @@ class RpLidar:
             stamp_ns = first_ns + np.arange(scan.batch, dtype=np.float64) * scan.mode.sample_ns
             turns = self._motor.turns(stamp_ns)
             if scan.mode.answer == ANSWER_CAPSULES:
-                self._wire.send(self._capsule(scan, turns, stamp_ns), done_ns)
+                self._wire.send(self._capsule(scan, turns, stamp_ns), done_ns, whole=True)
             else:
-                self._wire.send(self._nodes(scan, turns, stamp_ns), done_ns)
+                self._wire.send(self._nodes(scan, turns, stamp_ns), done_ns, whole=True)
 
     def _nodes(self, scan: _Scan, turns: F64, stamp_ns: F64) -> bytes:
         """Samples as 5-byte nodes."""

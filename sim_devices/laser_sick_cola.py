@@ -390,6 +390,8 @@ class SickColaLaser:
             "LocationName": [("s", "not defined")],
             "SCdevicestate": [("B", self._state(now_ns))],
             "STlms": self._lms_state(now_ns),
+            "LCMstate": [("B", 0)],  # the window is clean
+            "LSPdatetime": list(zip("HBBBBBI", self._wall_time(now_ns))),
             "ODoprh": [("I", 1234 + hours)],
             "ODpwrc": [("I", self._starts)],
             "LMPscancfg": self._scan_config(),

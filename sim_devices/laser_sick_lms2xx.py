@@ -121,7 +121,7 @@ class SickLms2xxLaser:
         address: int = 0,
         seed: int = 0,
         boot_s: float = 1.0,
-        config_write_s: float = 0.5,
+        config_write_s: float = 0.15,
         noise_scale: float = 1.0,
         dazzle: float = 0.0,
         pollution: float = 0.0,

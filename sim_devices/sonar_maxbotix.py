@@ -218,7 +218,7 @@ class MaxBotix(_Talker):
 
     def _say_next(self, now_ns: int) -> None:
         if self._ear.is_connected:
-            self._wire.send(self._ear.text(now_ns - self.family.period_ns) + b"\r", now_ns)
+            self._wire.send(self._ear.text(now_ns - self.family.period_ns) + b"\r", now_ns, whole=True)
         self._line_ns += self.family.period_ns
 
 
@@ -271,7 +271,7 @@ class TextMultiplexer(_Talker):
         self._turn += 1
         self._line_ns += self._cycle_ns
         if self._round and (not self._is_list or self._turn % len(self._ears) == 0):
-            self._wire.send(b" ".join(self._round) + b"\r\n", now_ns)
+            self._wire.send(b" ".join(self._round) + b"\r\n", now_ns, whole=True)
             self._round = []
 
     @property

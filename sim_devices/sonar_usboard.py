@@ -422,7 +422,7 @@ class UsBoardSerial:
 
     def _queue(self, messages: list[tuple[int, bytes, int]]) -> None:
         for _, data, at_ns in messages:
-            self._wire.send(b"\xff" + data + usboard_crc(data).to_bytes(2, "big"), at_ns)
+            self._wire.send(b"\xff" + data + usboard_crc(data).to_bytes(2, "big"), at_ns, whole=True)
 
 
 def packed_12bit(values: Sequence[int]) -> list[int]:

@@ -56,5 +56,10 @@ def check(
             typer.echo("no device is configured; add [lasers.NAME], [sonars.NAME] or [wheels.NAME]")
         for line in (*(f"{each.name}: {each.trouble}" for each in found if each.trouble), *problems):
             typer.secho(line, fg="red", err=True)
+        unheard = sorted(
+            {each.wire for each in found if each.state in ("silent", "starting") and each.wire.startswith("/")}
+        )
+        if unheard:
+            typer.echo(f"who answers there: umfeld devices detect {' '.join(unheard)}")
     if not is_well:
         raise typer.Exit(1)

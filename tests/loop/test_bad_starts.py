@@ -207,6 +207,7 @@ def test_another_device_on_the_port(place: Place, stranger: Callable[[], ByteDev
     told = assert_told(done, 1, "front: ")
     assert any(word in told for word in ("no Hokuyo", "not a Hokuyo", "another device", "does not answer")), told
     assert any(word in told for word in ("check", "port", "`")), told
+    assert f"umfeld devices detect {place.port}" in done.stdout
 
 
 def test_the_same_device_twice_is_found_where_it_is_right(place: Place) -> None:

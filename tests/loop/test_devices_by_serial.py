@@ -148,6 +148,31 @@ def test_detect_names_what_is_on_each_port_in_time_and_side_by_side(tmp_path: Pa
     assert took_s < 30.0, "one after the other would take minutes: a silent port alone takes twelve seconds"
 
 
+def test_an_old_urg_is_found_as_it_wakes_up_in_scip_1(tmp_path: Path) -> None:
+    attachment = Attachment()
+    laser = HokuyoLaser(Room(2.0), serial="H0300011", start_in_scip1=True)  # RS-232, 19200 bit/s
+    attachment.add("laser", laser, PtyLink(tmp_path / "laser"))
+    attachment.start()
+    try:
+        (found,) = detect.detect([(str(tmp_path / "laser"), "")])
+    finally:
+        attachment.stop()
+    assert (found.driver, found.speed_bps) == ("hokuyo", 19200)
+    assert found.identity is not None
+    assert (found.identity.serial, found.identity.model) == ("H0300011", "SOKUIKI Sensor URG-04LX")
+
+
+@pytest.mark.parametrize("end", [b"", b"\n"], ids=["as a real one", "by the book"])
+def test_an_old_urg_is_known_once_its_whole_answer_came(end: bytes) -> None:
+    told = b"VEND:Hokuyo\nPROD:URG\nFIRM:3.0.00\nPROT:00003,(SCIP 1.0)\nSERI:H7\n" + end
+    (probe,) = (probe for probe in detect.PROBES if probe.driver == "hokuyo")
+    said = b"VV\nE\n\nV\n0\n" + told
+    answers = [probe.recognise(said[:cut]) for cut in range(len(said) + 1)]
+    known = [answer for answer in answers if answer is not None]
+    assert len(known) == 1 + len(end)
+    assert known[0].serial == "H7"
+
+
 def test_no_noise_is_taken_for_a_device() -> None:
     random = np.random.default_rng(5)
     texts = [b"", b"Invalid Command\r\n" * 3, b"hello 57600 world\r\n", b"$GPGGA,123519,4807.038,N*47\r\n" * 5, b"V\r"]

@@ -213,6 +213,8 @@ def test_state_is_busy_until_the_mirror_is_up_to_speed() -> None:
     assert bench.say("sEN LMDscandata 0") == "sEA LMDscandata 0"
     assert bench.say("sRN SCdevicestate") == "sRA SCdevicestate 1"
     assert bench.say("sRN STlms").startswith("sRA STlms 7 0 8 00:00:01 A ")
+    assert bench.say("sRN LCMstate") == "sRA LCMstate 0"
+    assert bench.say("sRN LSPdatetime").startswith("sRA LSPdatetime 7B2 1 1 0 0 1 ")
 
 
 # -- configuration -----------------------------------------------------------------------------------------------------
