@@ -18,7 +18,7 @@ ItemT = TypeVar("ItemT")
 
 
 class BoundedQueue(Generic[ItemT]):
-    """Items of named sources, first in first out, never more than `limit` of them.
+    """Items of named sources, first in first out, never more than `limit` of them. Many may put, one thread gets.
 
     keep: tells what must not be thrown away while anything else can; by default the DeviceEvents.
     """
@@ -31,29 +31,34 @@ class BoundedQueue(Generic[ItemT]):
         self._items: deque[tuple[str, ItemT]] = deque()
         self._droppable: dict[str, int] = {}
         self._dropped: dict[str, int] = {}
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        # A bare lock as bell, since a Condition makes a lock for every wait and rings with its own lock held.
+        self._bell = threading.Lock()
+        self._bell.acquire()
+        self._waiting = False  # somebody waits for the bell, and nobody has rung it
 
     def put(self, source: str, item: ItemT) -> None:
         """Add an item; never blocks. May be given to a reader as its sink."""
-        with self._changed:
+        with self._lock:
             if len(self._items) >= self._limit:
                 self._drop_one()
             self._items.append((source, item))
             if not self._keep(item):
                 self._droppable[source] = self._droppable.get(source, 0) + 1
-            self._changed.notify()
+            ring, self._waiting = self._waiting, False
+        if ring:
+            self._bell.release()
 
     def get(self, timeout_s: float | None = None) -> tuple[str, ItemT] | None:
         """The oldest item with its source; None if nothing comes within timeout_s (None: wait for ever)."""
-        with self._changed:
-            if not self._changed.wait_for(lambda: bool(self._items), timeout_s):
-                return None
-            return self._take_first()
+        self._wait(timeout_s)
+        with self._lock:
+            return self._take_first() if self._items else None
 
     def get_all(self, timeout_s: float | None = None) -> list[tuple[str, ItemT]]:
         """Everything that waits, oldest first; an empty list if nothing comes within timeout_s."""
-        with self._changed:
-            self._changed.wait_for(lambda: bool(self._items), timeout_s)
+        self._wait(timeout_s)
+        with self._lock:
             items = list(self._items)
             self._items.clear()
             self._droppable.clear()
@@ -64,8 +69,21 @@ class BoundedQueue(Generic[ItemT]):
 
     def dropped(self) -> dict[str, int]:
         """How many items were thrown away because the queue was full, by source."""
-        with self._changed:
+        with self._lock:
             return dict(self._dropped)
+
+    def _wait(self, timeout_s: float | None) -> None:
+        """Until there is an item, or for timeout_s."""
+        with self._lock:
+            if self._items or timeout_s == 0.0:
+                return
+            self._waiting = True
+        if self._bell.acquire(timeout=-1 if timeout_s is None else min(timeout_s, threading.TIMEOUT_MAX)):
+            return
+        with self._lock:
+            is_rung, self._waiting = not self._waiting, False
+        if is_rung:  # just after the time was up: the bell must not ring for the next who waits
+            self._bell.acquire()
 
     def _take_first(self) -> tuple[str, ItemT]:
         source, item = self._items.popleft()

@@ -42,7 +42,7 @@ from service.live_map import SLAM, LiveMap, restore
 from service.locks import Claims
 from service.maker_calls import maker_calls
 from service.map_makers import MapMakers, SweepTap
-from service.outputs import HealthOut, Output, PolarOut, RectOut
+from service.outputs import HealthOut, OdomOut, Output, PolarOut, PoseOut, RangesOut, RectOut, ScanOut
 from service.payloads import RobotInfo, SensorPlace
 from service.publisher import Publisher
 from service.recording import RecordedFusion, Recorder
@@ -196,7 +196,7 @@ class Daemon:
             now_ns=self._clock.now_ns,
             beat=self._notifier.beat,
             health=self._health,
-            offered=self._publisher.wake,
+            offered=self._publisher.flush,
         )
         self._live_map = None
         if maps.building is not None:
@@ -345,6 +345,8 @@ class Daemon:
             output = self._ground.with_ground(output)
         if isinstance(output, PolarOut | RectOut):
             self._publisher.send(output)
+        elif isinstance(output, ScanOut | OdomOut | PoseOut | RangesOut):
+            self._publisher.defer(output)
         else:
             self._publisher.offer(output, wake=False)
         self._makers.take_output(output)

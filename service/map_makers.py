@@ -145,14 +145,18 @@ class Counting(Protocol):
         """By name; the names are always the same."""
 
 
-@dataclass(slots=True)
 class _Desk:
-    """What the thread remembers of one maker."""
+    """What the thread remembers of one maker. takes_*: what it wants besides sweeps, None if it does not: asking a
+    protocol every turn costs more than most turns."""
 
-    maker: MapMaker
-    due_ns: int = 0
-    is_fed: bool = False
-    changed: list[Rect] | None = None  # None: nothing
+    def __init__(self, maker: MapMaker) -> None:
+        self.maker = maker
+        self.due_ns = 0
+        self.is_fed = False
+        self.changed: list[Rect] | None = None  # None: nothing
+        self.takes_odometry = maker.take_odometry if isinstance(maker, MadeOfOdometry) else None
+        self.takes_clouds = maker.take_cloud if isinstance(maker, MadeOfClouds) else None
+        self.takes_looks = maker.take_look if isinstance(maker, MadeOfLooks) else None
 
 
 class MapMakers:
@@ -170,7 +174,7 @@ class MapMakers:
         self._clouds: deque[CloudOut] = deque()
         self._looks: deque[LookOut] = deque()
         self._odometry: deque[OdomOut] = deque()
-        self._wants_odometry = any(isinstance(maker, MadeOfOdometry) for maker in makers)
+        self._wants_odometry = any(desk.takes_odometry is not None for desk in self._desks)
         self._asked: deque[tuple[Callable[[], object], threading.Event, list[object]]] = deque()
         self._changed = threading.Condition()
         self._stopping = False
@@ -337,21 +341,21 @@ class MapMakers:
         for output in grids:
             self._note(self._mirror.take(output))
         for desk in self._desks:
-            if isinstance(desk.maker, MadeOfOdometry):
+            if desk.takes_odometry is not None:
                 for odom in odometry:
-                    self._guard(desk, partial(desk.maker.take_odometry, odom))
+                    self._guard(desk, partial(desk.takes_odometry, odom))
             for source, scan, map_from_sensor in sweeps:
                 if source in desk.maker.sources:
                     desk.is_fed = True
                     self._guard(desk, partial(desk.maker.take_sweep, source, scan, map_from_sensor))
-            if isinstance(desk.maker, MadeOfClouds):
+            if desk.takes_clouds is not None:
                 for cloud in clouds:
                     desk.is_fed = True
-                    self._guard(desk, partial(desk.maker.take_cloud, cloud))
-            if isinstance(desk.maker, MadeOfLooks):
+                    self._guard(desk, partial(desk.takes_clouds, cloud))
+            if desk.takes_looks is not None:
                 for look in looks:
                     desk.is_fed = True
-                    self._guard(desk, partial(desk.maker.take_look, look))
+                    self._guard(desk, partial(desk.takes_looks, look))
             if now_ns >= desk.due_ns and (desk.is_fed or desk.changed):
                 self._make(desk, now_ns)
 

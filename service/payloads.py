@@ -217,37 +217,16 @@ class Encoder:
 
     def _odom(self, out: OdomOut, offset_ns: int) -> list[Message]:
         stamp_ns, pose = out.stamp_ns + offset_ns, out.odom_from_base
-        payload = cdr.encode_odometry(
-            cdr.OdometryMessage(
-                stamp_ns,
-                self._frames.odom,
-                self._frames.base,
-                (pose.x_m, pose.y_m, 0.0),
-                _quaternion(pose.yaw_rad),
-                _planar_covariance(out.covariance),
-                (out.forward_m_s, 0.0, 0.0),
-                (0.0, 0.0, out.yaw_rad_s),
-                _UNKNOWN_COVARIANCE,
-            )
-        )
+        body = partial(_odometry_bytes, out, stamp_ns, self._frames.odom, self._frames.base)
         return [
-            Message(topics.ODOM, "odom", payload, stamp_ns),
+            Message(topics.ODOM, "odom", body, stamp_ns),
             self._transform(stamp_ns, self._frames.odom, self._frames.base, pose),
         ]
 
     def _pose(self, out: PoseOut, offset_ns: int) -> list[Message]:
-        stamp_ns, pose = out.stamp_ns + offset_ns, out.map_from_base
-        payload = cdr.encode_pose(
-            cdr.PoseWithCovariance(
-                stamp_ns,
-                self._frames.map,
-                (pose.x_m, pose.y_m, 0.0),
-                _quaternion(pose.yaw_rad),
-                _planar_covariance(out.covariance),
-            )
-        )
+        stamp_ns = out.stamp_ns + offset_ns
         return [
-            Message(topics.POSE_KEY, "pose", payload, stamp_ns),
+            Message(topics.POSE_KEY, "pose", partial(_pose_bytes, out, stamp_ns, self._frames.map), stamp_ns),
             self._transform(stamp_ns, self._frames.map, self._frames.odom, out.map_from_odom),
         ]
 
@@ -427,6 +406,29 @@ def _even_bins(bearing_rad: F64, range_m: F32) -> tuple[F32, float, float]:
 
 def _laser_bytes(scan: Scan, frame: str, stamp_ns: int, scan_time_s: float, beams: Beams) -> bytes:
     return cdr.encode_laser(laser_message(scan, frame, stamp_ns, scan_time_s, beams=beams))
+
+
+def _odometry_bytes(out: OdomOut, stamp_ns: int, frame: str, child: str) -> bytes:
+    pose = out.odom_from_base
+    return cdr.encode_odometry(
+        cdr.OdometryMessage(
+            stamp_ns,
+            frame,
+            child,
+            (pose.x_m, pose.y_m, 0.0),
+            _quaternion(pose.yaw_rad),
+            _planar_covariance(out.covariance),
+            (out.forward_m_s, 0.0, 0.0),
+            (0.0, 0.0, out.yaw_rad_s),
+            _UNKNOWN_COVARIANCE,
+        )
+    )
+
+
+def _pose_bytes(out: PoseOut, stamp_ns: int, frame: str) -> bytes:
+    pose = out.map_from_base
+    position, turn = (pose.x_m, pose.y_m, 0.0), _quaternion(pose.yaw_rad)
+    return cdr.encode_pose(cdr.PoseWithCovariance(stamp_ns, frame, position, turn, _planar_covariance(out.covariance)))
 
 
 def _transform_bytes(stamp_ns: int, frame: str, child: str, pose: Pose2) -> bytes:

@@ -1,11 +1,13 @@
 """Sends outputs over Zenoh: newest wins (of readings the newest eight), losses are counted; answers get() and calls.
 
 fusion --send---------------------------------> publishers            (sector maps: nothing may delay them)
-       --offer--> outbox --> stream thread --> publishers            (scans, poses, ranges, health)
+       --defer--> flush() --------------------> publishers            (scans, poses, ranges: when these have left)
+others --offer--> outbox --> stream thread --> publishers            (health, documents)
               \\-> outbox --> map thread   --> publishers            (grids: slow, so they delay nothing else)
                              last values --> answer thread --> get()
 
-Waking a thread costs more than most messages: who offers much at once says `wake=False`, and `wake()` once at the end.
+Waking a thread costs more than most messages: fusion sends what it measured by itself. Who offers much at once says
+`wake=False`, and `wake()` once at the end.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from service.payloads import Encoder, Message, RobotInfo
 from service.ros import RosMirror, RosSettings
 from service.rpc import Calls
 from service.topics import Lane
-from service.zenoh_session import NetworkSettings
+from service.zenoh_session import NetworkSettings, Readers
 
 _LOG = logging.getLogger(__name__)
 _UPDATES_WAITING_MAX = 64
@@ -148,10 +150,11 @@ class Publisher:
         self._session: Any = None
         self._token: Any = None
         self._outboxes = {lane: Outbox() for lane in Lane}
-        self._publishers: dict[str, Any] = {}
+        self._publishers: dict[str, tuple[Any, Readers | None]] = {}
         self._last: dict[str, _Kept] = {}
         self._queries: queue.Queue[Any] = queue.Queue(_QUERIES_WAITING_MAX)
         self._threads: list[threading.Thread] = []
+        self._deferred: list[Output] = []
         self._taps: list[Callable[[Message], None]] = []
         self._counts: Counter[str] = Counter()
         self._complained: set[str] = set()
@@ -185,12 +188,24 @@ class Publisher:
         self._threads.append(thread)
         thread.start()
 
-    def send(self, output: PolarOut | RectOut) -> None:
-        """Send a sector map at once, from the thread that has it; each map from one thread.
+    def send(self, output: Output) -> None:
+        """Send at once, from the thread that has it; outputs of one kind from one thread.
 
-        A congested link may hold this up as long as Zenoh waits before it drops, a millisecond by default.
+        A congested link may hold this up as long as Zenoh waits before it drops, a millisecond by default; what follows
+        is dropped without waiting.
         """
         self._send_all(partial(self._encode, output))
+
+    def defer(self, output: Output) -> None:
+        """Send from this thread with the next flush(). For one thread, the one that also calls flush()."""
+        self._deferred.append(output)
+
+    def flush(self) -> None:
+        """Send what was deferred, in order, and wake the threads for what was offered with wake=False."""
+        deferred, self._deferred = self._deferred, []
+        for output in deferred:
+            self.send(output)
+        self.wake()
 
     def wake(self) -> None:
         """After outputs were offered with wake=False."""
@@ -283,8 +298,8 @@ class Publisher:
         kept = self._last.get(message.suffix)
         if kept is None or kept.message is not message:
             self._last[message.suffix] = _Kept(message)
-        publisher = self._publisher_of(message)
-        if message.topic.cached or zenoh_session.is_read(publisher):  # a cache must hold it for late joiners
+        publisher, readers = self._publisher_of(message)
+        if readers is None or readers.any:
             publisher.put(message.payload, encoding=message.encoding, attachment=message.attachment)
             self._counts["sent"] += 1
         if self._ros is not None:
@@ -292,16 +307,18 @@ class Publisher:
         for tap in self._taps:
             tap(message)
 
-    def _publisher_of(self, message: Message) -> Any:
-        publisher = self._publishers.get(message.suffix)
-        if publisher is None:
+    def _publisher_of(self, message: Message) -> tuple[Any, Readers | None]:
+        """readers: None for a key whose cache must hold every value for late joiners."""
+        found = self._publishers.get(message.suffix)
+        if found is None:
             topic, key = message.topic, f"{self.base}/{message.suffix}"
             if topic.cached:
-                publisher = zenoh_session.declare_latched(self._session, key, topic.priority)
+                found = zenoh_session.declare_latched(self._session, key, topic.priority), None
             else:
-                publisher = zenoh_session.declare_stream(self._session, key, topic.priority, express=topic.express)
-            self._publishers[message.suffix] = publisher
-        return publisher
+                stream = zenoh_session.declare_stream(self._session, key, topic.priority, express=topic.express)
+                found = stream, Readers(stream)
+            self._publishers[message.suffix] = found
+        return found
 
     def _on_query(self, query: Any) -> None:
         try:

@@ -207,9 +207,23 @@ def declare_stream(session: zenoh.Session, key: str, priority: Priority, *, expr
     )
 
 
-def is_read(publisher: Any) -> bool:
-    """Whether a subscriber that is known now would get what this publisher puts; costs a microsecond."""
-    return bool(publisher.matching_status.matching)
+class Readers:
+    """Whether any subscriber would get what a publisher puts: kept up to date by Zenoh, since asking it for every
+    message costs some microseconds and the interpreter's lock."""
+
+    __slots__ = ("_listener", "_told", "any")
+
+    def __init__(self, publisher: Any) -> None:
+        self._told = False
+        self.any = True
+        self._listener = publisher.declare_matching_listener(self._hear)
+        now = bool(publisher.matching_status.matching)
+        if not self._told:  # else what was told since is newer
+            self.any = now
+
+    def _hear(self, status: Any) -> None:
+        self.any = bool(status.matching)
+        self._told = True
 
 
 def declare_latched(session: zenoh.Session, key: str, priority: Priority, *, depth: int = 1) -> Any:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 DEFAULT_PORT = 8765
-DRAWN = ("scan/*", "range/*", "sectors/polar/*", "pose", "odom", "map/**", "health/json", "info")
+DRAWN = ("scan/*", "range/*", "sectors/polar/*", "pose", "map/**", "health/json", "info")
 """What page.js takes. Each key more costs the daemon: a subscriber makes a put several times as dear."""
 _RING = 256
 _DRAIN = 64

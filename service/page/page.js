@@ -106,8 +106,7 @@ const HANDLERS = [
   [/^scan\/([^/]+)$/, (robot, payload, _a, [name]) => robot.scans.set(name, cdr.laserScan(payload))],
   [/^range\/([^/]+)$/, (robot, payload, _a, [name]) => robot.cones.set(name, json(payload))],
   [/^sectors\/polar\/([^/]+)$/, (robot, payload, _a, [name]) => robot.polar.set(name, json(payload))],
-  [/^pose$/, (robot, payload) => robot.addPose(cdr.poseWithCovariance(payload))],
-  [/^odom$/, (robot) => { for (const s of robot.health?.sources ?? []) if (s.kind === "wheels") robot.seen.set(s.name, performance.now()); }],
+  [/^pose$/, (robot, payload) => { robot.addPose(cdr.poseWithCovariance(payload)); seeWheels(robot); }],
   [/^map\/grid$/, (robot, payload, attachment) => robot.grid.full(cdr.occupancyGrid(payload), epochOf(attachment))],
   [/^map\/grid\/update$/, (robot, payload, attachment) => {
     if (epochOf(attachment) === robot.grid.epoch) robot.grid.update(cdr.occupancyGridUpdate(payload));
@@ -123,6 +122,11 @@ const HANDLERS = [
   [/^health\/json$/, (robot, payload) => takeHealth(robot, json(payload))],
   [/^info$/, (robot, payload) => { robot.info = json(payload); }],
 ];
+
+// A pose is made of the wheels' newest counts. (odom says so, too, but at up to 100 Hz, and nothing else here needs it.)
+function seeWheels(robot) {
+  for (const s of robot.health?.sources ?? []) if (s.kind === "wheels" && s.state === "running") robot.seen.set(s.name, performance.now());
+}
 
 function json(payload) { return JSON.parse(TEXT.decode(payload)); }
 

@@ -8,6 +8,7 @@ import struct
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -180,6 +181,27 @@ def test_what_nobody_reads_is_not_sent_and_get_has_it(publisher: Publisher, clie
     wait_until(is_quiet)
 
 
+def test_what_was_deferred_leaves_in_order_with_the_next_flush(publisher: Publisher, client: Client) -> None:
+    subscriber = client.subscribe(f"{BASE}/scan/*")
+    offer_until_it_arrives(publisher, scan_out(1), subscriber)
+    drain(subscriber)
+    stamps: list[int] = []
+
+    def take() -> int:
+        for sample in drain(subscriber):
+            if sample.key.endswith("/rear"):
+                stamps.append(cdr.decode_laser(sample.payload).stamp_ns)
+        return len(stamps)
+
+    for stamp_ns in (1_000_000_000, 2_000_000_000, 3_000_000_000):
+        publisher.defer(scan_out(stamp_ns, "rear"))
+    assert take() == 0
+    publisher.flush()
+    publisher.flush()  # nothing is sent twice
+    wait_until(lambda: take() >= 3)
+    assert [round((later - earlier) / 1e9) for earlier, later in pairwise(stamps)] == [1, 1]
+
+
 def test_a_reader_behind_another_router_counts(publisher: Publisher, endpoint: str) -> None:
     """A fleet's router that is linked to the daemon's: what is read there is sent."""
     there = free_endpoint()
@@ -336,7 +358,9 @@ def test_close_is_quick_and_final(endpoint: str) -> None:
 
 def test_a_bad_value_is_counted_and_silences_nothing(publisher: Publisher, client: Client) -> None:
     subscriber = client.subscribe(f"{BASE}/scan/**")
+    poses = client.subscribe(f"{BASE}/pose")  # what nobody reads is not even made
     offer_until_it_arrives(publisher, scan_out(), subscriber)
+    offer_until_it_arrives(publisher, PoseOut(1, Pose2(), Pose2(), np.eye(3)), poses)
     publisher.offer(PoseOut(1, Pose2(), Pose2(), np.eye(2)))  # a covariance of the wrong shape
     wait_until(lambda: publisher.counters().get("not_sent_errors"))
     publisher.offer(scan_out(2))

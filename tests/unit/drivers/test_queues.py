@@ -1,0 +1,51 @@
+"""The queue between readers and fusion: who waits is woken once, and nothing is lost around a time-out."""
+
+from __future__ import annotations
+
+import threading
+
+from drivers.queues import BoundedQueue
+
+
+def test_who_waits_is_woken() -> None:
+    queue: BoundedQueue[int] = BoundedQueue(10)
+    got: list[tuple[str, int]] = []
+    waiter = threading.Thread(target=lambda: got.extend(queue.get_all(30.0)))
+    waiter.start()
+    queue.put("a", 1)
+    waiter.join(10.0)
+    assert not waiter.is_alive()
+    assert got == [("a", 1)]
+
+
+def test_nothing_is_lost_and_no_ring_is_left_over_around_time_outs() -> None:
+    """Puts that fall together with the end of a wait: every item comes, in order, and afterwards waiting is waiting."""
+    queue: BoundedQueue[int] = BoundedQueue(100_000)
+    count = 3000
+
+    def put_all() -> None:
+        for number in range(count):
+            queue.put("a", number)
+            if number % 7 == 0:
+                threading.Event().wait(0.0002)
+
+    putter = threading.Thread(target=put_all)
+    putter.start()
+    got: list[int] = []
+    while len(got) < count:
+        got.extend(item for _, item in queue.get_all(0.0001))
+    putter.join(10.0)
+    assert got == list(range(count))
+    assert queue.get_all(0.01) == []
+    assert queue.get(0.01) is None
+    assert not queue._bell.acquire(blocking=False)  # a ring that is left over would end the next wait at once
+
+
+def test_without_time_to_wait_it_does_not_wait() -> None:
+    queue: BoundedQueue[int] = BoundedQueue(10)
+    assert queue.get_all(0.0) == []
+    assert queue.get(0.0) is None
+    queue.put("a", 1)
+    queue.put("b", 2)
+    assert queue.get(0.0) == ("a", 1)
+    assert queue.get_all(None) == [("b", 2)]
