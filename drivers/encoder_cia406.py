@@ -10,7 +10,7 @@
     700 + n    heartbeat                                            00 boot-up, 7F pre-operational, 05 operational, 04
 
 Each node: pre-operational -> who are you (1000h, 1018h, 1008h), how do you count (6001h, 6002h) -> heartbeat 100 ms,
-TPDO2 on each SYNC -> start. When both are started we send SYNC at the wanted rate; a reading is complete when both have
+TPDO2 on each SYNC, TPDO1 off where SYNC is ours (100 frames a second that nobody needs) -> start. When both are started we send SYNC at the wanted rate; a reading is complete when both have
 answered the same SYNC. A node that boots, falls silent or leaves the operational state is set up again.
 
 Why not the `canopen` package: it owns threads and the bus; what is needed of CiA 301 here is an SDO client and a few
@@ -131,8 +131,17 @@ class _Node:
     """One encoder: found, set up, started, watched."""
 
     def __init__(
-        self, node: int, side: str, counters: SourceCounters, *, period_ms: int, max_turns_per_s: float
+        self,
+        node: int,
+        side: str,
+        counters: SourceCounters,
+        *,
+        period_ms: int,
+        max_turns_per_s: float,
+        only_on_sync: bool,
     ) -> None:
+        """only_on_sync: nobody else on the bus is to have its positions: those it sends by timer are switched off."""
+        self._only_on_sync = only_on_sync
         self.node = node
         self.name = f"node {node:02X}h ({side})"
         self._counters = counters
@@ -268,6 +277,9 @@ class _Node:
 
     def _go_on(self, done: SdoDone, now_ns: int) -> None:
         """An SDO transfer has ended: the next step of the set-up."""
+        if self.phase is _Phase.STARTED:
+            self._go_on_afterwards(done, now_ns)
+            return
         if done.abort_code == TIMED_OUT:
             self.begin(max(now_ns, self._search_due_ns), cyclic=self.cyclic)
             self.missing = True
@@ -281,15 +293,29 @@ class _Node:
         try:
             self._sdo.ask(self._script.send(done), now_ns)
         except StopIteration:
-            self._script = None
             self.phase = _Phase.STARTED
             self._start_due_ns = now_ns
             self._heard_ns = now_ns
+            self._script = None
+            if self._only_on_sync and not self.cyclic:
+                self._script = _switch_off(0x1800)
+                self._sdo.ask(next(self._script), now_ns)
         except (_Refused, SdoAborted) as error:
             self._script = None
             self.phase = _Phase.SEARCHING
             self._search_due_ns = now_ns + _REFUSED_RETRY_NS
             self.refusal = str(error)
+
+    def _go_on_afterwards(self, done: SdoDone, now_ns: int) -> None:
+        """The same of what may fail: the node reads well without it."""
+        if self._script is None:
+            return
+        try:
+            if done.abort_code == TIMED_OUT:
+                raise StopIteration
+            self._sdo.ask(self._script.send(done), now_ns)
+        except StopIteration:
+            self._script = None
 
     def _set_up(self) -> Script:
         """The questions and settings in order; each `yield` is one SDO transfer."""
@@ -387,6 +413,13 @@ def _switch_on(communication: int, cob_id: int) -> Generator[Upload | Download, 
         yield Download(communication, 1, (cob_id & ~_PDO_DISABLED).to_bytes(4, "little"))
 
 
+def _switch_off(communication: int) -> Generator[Upload | Download, SdoDone, None]:
+    """A PDO is not sent any more; a node that refuses goes on sending it."""
+    cob_id = yield from _number(Upload(communication, 1))
+    if cob_id and not cob_id & _PDO_DISABLED:
+        yield Download(communication, 1, (cob_id | _PDO_DISABLED).to_bytes(4, "little"))
+
+
 def _send_on_sync() -> Generator[Upload | Download, SdoDone, None]:
     """TPDO2: the position, after each SYNC."""
     cob_id = yield from _number(Upload(0x1801, 1))
@@ -466,7 +499,14 @@ class _Cia406Conversation(ABC):
         self._last_stamp_ns = -_NEVER
         period_ms = max(1, round(1e3 / sync_rate_hz))
         self._nodes = [
-            _Node(node, what, self._counters, period_ms=period_ms, max_turns_per_s=max_turns_per_s)
+            _Node(
+                node,
+                what,
+                self._counters,
+                period_ms=period_ms,
+                max_turns_per_s=max_turns_per_s,
+                only_on_sync=produce_sync,
+            )
             for node, what in nodes
         ]
         self._restart(0)

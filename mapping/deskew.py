@@ -26,13 +26,17 @@ class Deskewed:
 
     scan: bearings and ranges in the sensor frame of that instant; the order of beams is kept, +inf, -inf and NaN stay
     what they are (a beam without echo is turned, not moved).  origin_m: (N, 2) where each beam really started, in that
-    frame.  spread_m: the largest distance of an origin from the frame's own.
+    frame.
     """
 
     scan: Scan
     odom_from_sensor: Pose2
     origin_m: F64
-    spread_m: float
+
+    @property
+    def spread_m(self) -> float:
+        """The largest distance of an origin from the frame's own."""
+        return float(np.hypot(self.origin_m[:, 0], self.origin_m[:, 1]).max(initial=0.0))
 
 
 def beam_stamps(scan: Scan) -> NDArray[np.int64]:
@@ -60,7 +64,7 @@ def deskew(scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> D
     reference = odom_from_base.at(reference_ns) @ base_from_sensor
     if not len(stamps) or scan.beam_period_ns == 0.0:
         at_once = Scan(reference_ns, 0.0, scan.bearing_rad, scan.range_m, scan.range_min_m, scan.range_max_m)
-        return Deskewed(at_once, reference, np.zeros((len(stamps), 2)), 0.0)
+        return Deskewed(at_once, reference, np.zeros((len(stamps), 2)))
     sensor = kernels.carried(
         odom_from_base.at_many(stamps), base_from_sensor.x_m, base_from_sensor.y_m, base_from_sensor.yaw_rad
     )
@@ -68,4 +72,4 @@ def deskew(scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> D
         sensor, reference.x_m, reference.y_m, reference.yaw_rad, scan.bearing_rad, scan.range_m
     )
     moved = Scan(reference_ns, 0.0, bearing, distance, scan.range_min_m, scan.range_max_m)
-    return Deskewed(moved, reference, origin, float(np.hypot(origin[:, 0], origin[:, 1]).max()))
+    return Deskewed(moved, reference, origin)

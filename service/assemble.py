@@ -616,11 +616,14 @@ def _artos_map(config: Config, polar: Sequence[PolarLayer]) -> ArtosLayer:
 
 
 def _sector_maps(config: Config) -> Iterator[PolarLayer | RectLayer]:
+    from mapping.sectors.footprint import checked_polygon
+    from mapping.sectors.inputs import FanReader
     from mapping.sectors.polar import PolarSectors
     from mapping.sectors.rectangular import RectSectors
     from service.layers import PolarLayer, RectLayer
 
     footprint = np.array(config.robot.footprint_m)
+    fans = FanReader(checked_polygon(footprint))
     for name, polar in sorted(config.sectors.polar.items()):
         fed_by = _in_order(config, polar.sources)
         yield PolarLayer(
@@ -634,6 +637,7 @@ def _sector_maps(config: Config) -> Iterator[PolarLayer | RectLayer]:
                 stale_after_ns=SECTOR_MEMORY_NS,
                 footprint=footprint,
                 range_max_m=math.inf if polar.range_max_m is None else polar.range_max_m,
+                fans=fans,
             ),
             fed_by,
         )
@@ -648,6 +652,7 @@ def _sector_maps(config: Config) -> Iterator[PolarLayer | RectLayer]:
                 base_from_sensor=pose_of(rect.pose),
                 stale_after_ns=SECTOR_MEMORY_NS,
                 footprint=footprint,
+                fans=fans,
             ),
             fed_by,
         )

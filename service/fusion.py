@@ -440,9 +440,8 @@ class Fusion:
         self._fresh_until_ns[laser.name] = min(scan.stamp_ns, now_ns) + stale_after_ns(reading.scan_period_ns, sweep_ns)
         if fed := self._fed_by(laser.name):
             seen, base_from_sensor = self._as_seen_now(scan, laser.base_from_sensor)
-            seen = replace(
-                seen, stamp_ns=min(scan.stamp_ns, now_ns)
-            )  # ages count from the first beam, never from later
+            first_ns = min(scan.stamp_ns, now_ns)  # ages count from the first beam, never from later
+            seen = replace(seen, stamp_ns=first_ns)
             for index in fed:
                 self._parts.sectors[index].take_scan(laser.name, seen, base_from_sensor)
                 yield self._tell(index, now_ns)
@@ -938,9 +937,8 @@ class _ContactMemory:
 
 def compose_many(a_from_b: Pose2, b_from_c: F64) -> F64:
     """a_from_c (N, 3) of one pose and many."""
-    c, s = math.cos(a_from_b.yaw_rad), math.sin(a_from_b.yaw_rad)
-    x, y, yaw = b_from_c[:, 0], b_from_c[:, 1], b_from_c[:, 2]
-    return np.stack((a_from_b.x_m + c * x - s * y, a_from_b.y_m + s * x + c * y, a_from_b.yaw_rad + yaw), axis=-1)
+    placed: F64 = motion.placed(np.ascontiguousarray(b_from_c), a_from_b.x_m, a_from_b.y_m, a_from_b.yaw_rad)
+    return placed
 
 
 def carry(a_from_b: F64, b_from_c: Pose2) -> F64:

@@ -29,12 +29,24 @@ def arc_coefficients(w: float) -> tuple[float, float]:
     return math.sin(w) / w, (1.0 - math.cos(w)) / w
 
 
+FOUND, NOT_YET, GONE = 0, 1, 2
+
+
 @njit(cache=True)
-def poses_at(asked: Any, stamps: Any, pose: Any, stretch: Any, found: Any) -> bool:
+def poses_at(asked: Any, stamps: Any, pose: Any, stretch: Any, found: Any) -> int:
     """Poses at asked times (N,) along arcs of constant twist between the two poses around each, into found (N, 3).
 
-    stamps: (M,) rising, M >= 2, around all that is asked.  False if an arc would cross from one stretch to another.
+    stamps: (M,) rising, M >= 2.  NOT_YET if any time lies beyond them, else GONE if any lies before them, or if an arc
+    would cross from one stretch to another.
     """
+    oldest, newest = stamps[0], stamps[-1]
+    is_gone = False
+    for k in range(len(asked)):
+        if asked[k] > newest:
+            return NOT_YET
+        is_gone |= asked[k] < oldest
+    if is_gone:
+        return GONE
     known = -1  # the arc whose coefficients are at hand
     at = 1
     cos = sin = vx = vy = turn = span = 0.0
@@ -54,14 +66,14 @@ def poses_at(asked: Any, stamps: Any, pose: Any, stretch: Any, found: Any) -> bo
             vx, vy = (a * x + b * y) / norm, (a * y - b * x) / norm
             span = float(stamps[at] - stamps[at - 1])
         if stretch[at] != stretch[at - 1] and t != stamps[at - 1] and t != stamps[at]:
-            return False
+            return GONE
         share = (t - stamps[at - 1]) / span
         a, b = arc_coefficients(share * turn)
         x, y = share * (a * vx - b * vy), share * (b * vx + a * vy)
         found[k, 0] = pose[at - 1, 0] + cos * x - sin * y
         found[k, 1] = pose[at - 1, 1] + sin * x + cos * y
         found[k, 2] = wrapped(pose[at - 1, 2] + share * turn)
-    return True
+    return FOUND
 
 
 @njit(cache=True)
@@ -93,6 +105,18 @@ def carried(pose: Any, x: float, y: float, yaw: float) -> Any:
         moved[k, 0] = pose[k, 0] + cos * x - sin * y
         moved[k, 1] = pose[k, 1] + sin * x + cos * y
         moved[k, 2] = pose[k, 2] + yaw
+    return moved
+
+
+@njit(cache=True)
+def placed(pose: Any, x: float, y: float, yaw: float) -> Any:
+    """(N, 3) poses a_from_c of one a_from_b and many b_from_c (N, 3); yaw is not wrapped."""
+    moved = np.empty_like(pose)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    for k in range(len(pose)):
+        moved[k, 0] = x + cos * pose[k, 0] - sin * pose[k, 1]
+        moved[k, 1] = y + sin * pose[k, 0] + cos * pose[k, 1]
+        moved[k, 2] = yaw + pose[k, 2]
     return moved
 
 

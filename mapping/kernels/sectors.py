@@ -174,27 +174,49 @@ def gaps_between(bearing: Any) -> Any:
 
 
 @njit(cache=True)
-def thin_sectors(bearing: Any, distance: Any, range_max: float, gap_max: float, spacing: float) -> tuple[Any, Any, Any]:
-    """The thin sector of every beam and how long it is: lo, hi, length (N,) each.
+def are_ascending(bearing: Any) -> bool:
+    """Whether (N,) bearings, N > 0, never fall and lie within one turn."""
+    for k in range(1, len(bearing)):
+        if not bearing[k] >= bearing[k - 1]:
+            return False
+    return bool(bearing[-1] - bearing[0] < TWO_PI)
+
+
+@njit(cache=True)
+def thin_sectors(
+    bearing: Any, distance: Any, range_max: float, gap_max: float, spacing: float
+) -> tuple[Any, Any, Any, Any, Any]:
+    """Thin sectors of beams: lo, hi, length (M,) of those with a length, lo, hi (K,) of all valid ones.
 
     bearing: (N,) ascending within one turn.  Neighbours no farther apart than gap_max meet half-way, others leave half
-    a spacing.  length: range_max for a beam that saw nothing, 0 where nothing is proved free, NaN of an invalid beam.
+    a spacing.  length: range_max for a beam that saw nothing; none where nothing is proved free.
     """
     count = len(bearing)
-    lo, hi, length = np.empty(count), np.empty(count), np.empty(count)
+    lo, hi = np.empty(count), np.empty(count)
     for k in range(count):
         gap = bearing[k + 1] - bearing[k] if k + 1 < count else bearing[0] + TWO_PI - bearing[k]
         reach = 0.5 * gap if gap <= gap_max else 0.5 * spacing
         hi[k] = bearing[k] + reach
         lo[k + 1 if k + 1 < count else 0] = bearing[k + 1 if k + 1 < count else 0] - reach
+    seen_lo, seen_hi, length = np.empty(count), np.empty(count), np.empty(count)
+    looked_lo, looked_hi = np.empty(count), np.empty(count)
+    sees = looks = 0
+    for k in range(count):
         r = distance[k]
         if r == math.inf:
-            length[k] = range_max if range_max < math.inf else 0.0
+            r = range_max if range_max < math.inf else 0.0
         elif r > 0.0:
-            length[k] = r if r <= range_max else 0.0
-        else:  # too close, zero; a negative number is no range
-            length[k] = 0.0 if r == 0.0 or r == -math.inf else math.nan
-    return lo, hi, length
+            r = r if r <= range_max else 0.0
+        elif r == 0.0 or r == -math.inf:  # too close
+            r = 0.0
+        else:  # invalid; a negative number is no range
+            continue
+        looked_lo[looks], looked_hi[looks] = lo[k], hi[k]
+        looks += 1
+        if r > 0.0:
+            seen_lo[sees], seen_hi[sees], length[sees] = lo[k], hi[k], r
+            sees += 1
+    return seen_lo[:sees], seen_hi[:sees], length[:sees], looked_lo[:looks], looked_hi[:looks]
 
 
 @njit(cache=True)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.frames import Pose2
 from mapping.kernels import beams as kernels
-from mapping.sectors.sight import Sight, arc_of_cone, end_points, median_spacing, sight_of_beams, sight_of_cone
+from mapping.sectors.sight import Sight, Star, arc_of_cone, end_points, median_spacing, sight_of_cone, star_of_beams
 
 F64 = NDArray[np.float64]
 
@@ -88,25 +89,82 @@ def without_self(
     return cleaned if dropped > 0 else range_m
 
 
-def see_beams(
-    bearing_rad: F64,
-    range_m: F64,
-    *,
-    range_min_m: float,
-    range_max_m: float,
-    spacing_rad: float,
-    virtual_from_sensor: Pose2,
-) -> tuple[Sight, F64]:
-    """What a fan of beams has seen, and its (M, 2) obstacles in the virtual sensor's frame."""
-    sight = sight_of_beams(
-        bearing_rad,
-        range_m,
-        range_max_m=range_max_m,
-        spacing_rad=spacing_rad,
-        virtual_from_sensor=virtual_from_sensor,
-    )
-    points = end_points(bearing_rad, range_m, range_min_m=range_min_m, virtual_from_sensor=virtual_from_sensor)
-    return sight, points
+@dataclass(frozen=True, slots=True)
+class Fan:
+    """A sweep as every map takes it: (N,) bearings and ranges without the vehicle's own, and the star it has seen."""
+
+    bearing_rad: F64
+    range_m: F64
+    star: Star
+
+    def seen_from(self, virtual_from_sensor: Pose2, range_min_m: float) -> tuple[Sight, F64]:
+        """What was seen, and (M, 2) obstacles, both in the frame of a map's virtual sensor."""
+        points = end_points(
+            self.bearing_rad, self.range_m, range_min_m=range_min_m, virtual_from_sensor=virtual_from_sensor
+        )
+        return Sight(virtual_from_sensor, self.star), points
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """What a fan was made of, and what was made."""
+
+    source: str
+    stamp_ns: int
+    bearing_rad: ArrayLike
+    range_m: ArrayLike
+    base_from_sensor: Pose2
+    range_max_m: float
+    spacing_rad: float | None
+    fan: Fan
+
+    def is_of(
+        self, source: str, stamp_ns: int, bearing_rad: ArrayLike, range_m: ArrayLike, base_from_sensor: Pose2,
+        range_max_m: float, spacing_rad: float | None,
+    ) -> bool:  # fmt: skip
+        """Whether these very arrays were read, at the same time and place."""
+        return (
+            self.bearing_rad is bearing_rad
+            and self.range_m is range_m
+            and self.stamp_ns == stamp_ns
+            and self.source == source
+            and self.base_from_sensor == base_from_sensor
+            and self.range_max_m == range_max_m
+            and self.spacing_rad == spacing_rad
+        )
+
+
+class FanReader:
+    """Makes fans of sweeps. Maps that take the same sweeps may share one, so that what they have in common is worked
+    out once: the newest fan is remembered. footprint: (V, 2), beams that end in it are left out; None: none are."""
+
+    def __init__(self, footprint: F64 | None) -> None:
+        self._footprint = footprint
+        self._spacing = SpacingMemory()
+        self._last: _Read | None = None
+
+    def read(
+        self, source: str, stamp_ns: int, bearing_rad: ArrayLike, range_m: ArrayLike, base_from_sensor: Pose2,
+        range_max_m: float, spacing_rad: float | None,
+    ) -> Fan:  # fmt: skip
+        """The fan of a sweep, whose arrays must not be written to afterwards. ValueError if their shapes differ."""
+        last = self._last
+        if last is not None and last.is_of(
+            source, stamp_ns, bearing_rad, range_m, base_from_sensor, range_max_m, spacing_rad
+        ):
+            return last.fan
+        bearing, ranges = checked_beams(bearing_rad, range_m)
+        if self._footprint is not None:
+            ranges = without_self(bearing, ranges, base_from_sensor, self._footprint)
+        spacing = self._spacing.of(source, bearing, spacing_rad)
+        fan = Fan(bearing, ranges, star_of_beams(bearing, ranges, range_max_m=range_max_m, spacing_rad=spacing))
+        self._last = _Read(source, stamp_ns, bearing_rad, range_m, base_from_sensor, range_max_m, spacing_rad, fan)
+        return fan
+
+    def forget(self, source: str) -> None:
+        """The device is gone; what answers next may be set differently."""
+        self._spacing.forget(source)
+        self._last = None
 
 
 def see_cone(

@@ -13,13 +13,10 @@ from mapping.kernels import sectors as kernels
 from mapping.sectors.evidence import Evidence, Finding
 from mapping.sectors.footprint import Outline, checked_polygon
 from mapping.sectors.inputs import (
-    SpacingMemory,
-    checked_beams,
+    FanReader,
     cones_remembered,
-    see_beams,
     see_cone,
     touched_line,
-    without_self,
 )
 from mapping.sectors.sight import Sight, arc_of_cone
 from mapping.sectors.snapshot import PolarSnapshot, SectorState
@@ -51,7 +48,8 @@ class PolarSectors:
     frame: distances to it are reported, its inside needs no looking at and, with self_filter, beams that end in it
     are ignored.  sources: names that may call update_*.  stale_after_ns: one limit, or one for each source.
     range_max_m: what lies farther does not count.  cone_free_share: part of a sonar's range, or of the distance of
-    its echo, that its silence clears: an object that reflects badly is heard only from nearer.
+    its echo, that its silence clears: an object that reflects badly is heard only from nearer.  fans: shared with other
+    maps of the same footprint, which also decides there what is left out.
     """
 
     def __init__(
@@ -68,6 +66,7 @@ class PolarSectors:
         self_filter: bool = True,
         cone_free_share: float = 0.5,
         wait_for_sources: bool = True,
+        fans: FanReader | None = None,
     ) -> None:
         if not 0.0 <= cone_free_share <= 1.0 or not range_max_m > 0.0:
             raise ValueError("cone_free_share must be within 0 and 1, range_max_m above 0")
@@ -79,9 +78,9 @@ class PolarSectors:
         self._cone_free_share = cone_free_share
         self._virtual_from_base = base_from_sensor.inverse()
         self._outline = Outline(footprint, base_from_sensor)
-        self._footprint = checked_polygon(footprint) if footprint is not None and self_filter else None
+        own = checked_polygon(footprint) if footprint is not None and self_filter else None
+        self._fans = FanReader(own) if fans is None else fans
         self._frame = _Wedges(self.edges_rad, sector_rad, range_max_m, self._outline)
-        self._spacing = SpacingMemory()
         self._heard = lru_cache(cones_remembered(len(self.edges_rad) - 1))(self._find_in_cone)
         self._evidence = Evidence(
             count=len(self.edges_rad) - 1,
@@ -108,17 +107,8 @@ class PolarSectors:
         than 1.5 times that leave a gap nobody looked through.  Raises ValueError for an unknown source.
         """
         self._evidence.index(source)
-        bearing, ranges = checked_beams(bearing_rad, range_m)
-        if self._footprint is not None:
-            ranges = without_self(bearing, ranges, base_from_sensor, self._footprint)
-        sight, points = see_beams(
-            bearing,
-            ranges,
-            range_min_m=range_min_m,
-            range_max_m=range_max_m,
-            spacing_rad=self._spacing.of(source, bearing, spacing_rad),
-            virtual_from_sensor=self._virtual_from_base @ base_from_sensor,
-        )
+        fan = self._fans.read(source, stamp_ns, bearing_rad, range_m, base_from_sensor, range_max_m, spacing_rad)
+        sight, points = fan.seen_from(self._virtual_from_base @ base_from_sensor, range_min_m)
         nearest_m, at_rad = self._frame.nearest(points)
         finding = Finding(nearest_m, at_rad, at_rad, self._frame.free(sight), np.zeros(len(nearest_m), dtype=bool))
         self._evidence.revise(
@@ -198,7 +188,7 @@ class PolarSectors:
     def lost(self, source: str) -> None:
         """The device is gone: its evidence is stale now, not only when its time is up."""
         self._evidence.lost(source)
-        self._spacing.forget(source)
+        self._fans.forget(source)
 
     def snapshot(self, now_ns: int) -> PolarSnapshot:
         """What is known at an instant, immutable, in bearing order."""
@@ -255,7 +245,12 @@ class _Wedges:
         if sight.from_origin:
             yaw = sight.virtual_from_sensor.yaw_rad
             from_origin: F64 = kernels.free_from_origin(
-                sight.lo_rad + yaw, sight.hi_rad + yaw, sight.length_m, self._edges, self._width, self._range_max_m
+                sight.star.lo_rad + yaw,
+                sight.star.hi_rad + yaw,
+                sight.star.length_m,
+                self._edges,
+                self._width,
+                self._range_max_m,
             )
             return from_origin
         free: F64 = kernels.free_reach(

@@ -13,13 +13,10 @@ from mapping.kernels import sectors as kernels
 from mapping.sectors.evidence import Evidence, Finding
 from mapping.sectors.footprint import Outline, checked_polygon
 from mapping.sectors.inputs import (
-    SpacingMemory,
-    checked_beams,
+    FanReader,
     cones_remembered,
-    see_beams,
     see_cone,
     touched_line,
-    without_self,
 )
 from mapping.sectors.sight import Sight, arc_of_cone
 from mapping.sectors.snapshot import RectSnapshot
@@ -50,6 +47,7 @@ class RectSectors:
         self_filter: bool = True,
         cone_free_share: float = 0.5,
         wait_for_sources: bool = True,
+        fans: FanReader | None = None,
     ) -> None:
         if not 0.0 <= cone_free_share <= 1.0:
             raise ValueError("cone_free_share must be within 0 and 1")
@@ -58,12 +56,12 @@ class RectSectors:
         self.base_from_sensor = base_from_sensor
         self._cone_free_share = cone_free_share
         self._virtual_from_base = base_from_sensor.inverse()
-        self._footprint = checked_polygon(footprint) if footprint is not None and self_filter else None
+        own = checked_polygon(footprint) if footprint is not None and self_filter else None
+        self._fans = FanReader(own) if fans is None else fans
         self._shape = (len(self.y_edges_m) - 1, len(self.x_edges_m) - 1)
         if self._shape[0] * self._shape[1] > _SECTORS_MAX:
             raise ValueError(f"{self._shape[0]} x {self._shape[1]} sectors are too many: enlarge sector_m")
         self._raster = _Raster(self.x_edges_m, self.y_edges_m, sector_m, Outline(footprint, base_from_sensor))
-        self._spacing = SpacingMemory()
         self._heard = lru_cache(cones_remembered(self._shape[0] * self._shape[1]))(self._find_in_cone)
         self._evidence = Evidence(
             count=self._shape[0] * self._shape[1],
@@ -86,17 +84,8 @@ class RectSectors:
     ) -> None:
         """Take a whole fan of beams; as PolarSectors.update_beams."""
         self._evidence.index(source)
-        bearing, ranges = checked_beams(bearing_rad, range_m)
-        if self._footprint is not None:
-            ranges = without_self(bearing, ranges, base_from_sensor, self._footprint)
-        sight, points = see_beams(
-            bearing,
-            ranges,
-            range_min_m=range_min_m,
-            range_max_m=range_max_m,
-            spacing_rad=self._spacing.of(source, bearing, spacing_rad),
-            virtual_from_sensor=self._virtual_from_base @ base_from_sensor,
-        )
+        fan = self._fans.read(source, stamp_ns, bearing_rad, range_m, base_from_sensor, range_max_m, spacing_rad)
+        sight, points = fan.seen_from(self._virtual_from_base @ base_from_sensor, range_min_m)
         nearest_m, x, y = self._raster.nearest(points)
         finding = Finding(nearest_m, x, y, self._raster.free(sight), np.zeros(len(x), dtype=bool))
         self._evidence.revise(
@@ -166,7 +155,7 @@ class RectSectors:
     def lost(self, source: str) -> None:
         """The device is gone: its evidence is stale now, not only when its time is up."""
         self._evidence.lost(source)
-        self._spacing.forget(source)
+        self._fans.forget(source)
 
     def snapshot(self, now_ns: int) -> RectSnapshot:
         """What is known at an instant, immutable."""
@@ -224,7 +213,7 @@ class _Raster:
         """(N,) the far corner's distance where all of a square outside the vehicle was seen, 0 for the others."""
         pose = sight.virtual_from_sensor
         free: F64 = kernels.free_cells(
-            sight.lo_rad, sight.hi_rad, sight.length_m, pose.x_m, pose.y_m, pose.yaw_rad,
+            sight.star.lo_rad, sight.star.hi_rad, sight.star.length_m, pose.x_m, pose.y_m, pose.yaw_rad,
             self._x0, self._y0, self._edge, self._rows, self._cols, self._body, self._reach_m,
             self._corner_exempt, self._middle_exempt, self._under_vehicle, self._far_m,
         )  # fmt: skip

@@ -30,20 +30,26 @@ _LEAST_RANGE_M = 1e-6  # an obstacle at range zero still has a bearing
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
-    """The star a sensor has seen, and which way it looked at all.
+class Star:
+    """What a sensor has seen, in its own frame, and which way it looked at all.
 
-    virtual_from_sensor: where it stands.  lo_rad, hi_rad, length_m: (M,) thin sectors with a length, sensor frame,
-    ascending, apart, within one turn.  looked_lo_rad, looked_hi_rad: (K,) the same for every valid beam, also those
-    too close to measure.
+    lo_rad, hi_rad, length_m: (M,) thin sectors with a length, ascending, apart, within one turn.
+    looked_lo_rad, looked_hi_rad: (K,) the same for every valid beam, also those too close to measure.
     """
 
-    virtual_from_sensor: Pose2
     lo_rad: F64
     hi_rad: F64
     length_m: F64
     looked_lo_rad: F64
     looked_hi_rad: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """A star, and where its sensor stands: virtual_from_sensor."""
+
+    virtual_from_sensor: Pose2
+    star: Star
 
     @property
     def from_origin(self) -> bool:
@@ -52,24 +58,24 @@ class Sight:
 
     def border(self) -> F64:
         """(M, 2) corners of the star, virtual sensor frame, closed, counter-clockwise; chords stand for its arcs."""
-        if len(self.lo_rad) == 0:
+        star, pose = self.star, self.virtual_from_sensor
+        if len(star.lo_rad) == 0:
             return np.empty((0, 2))
-        pose = self.virtual_from_sensor
-        border: F64 = kernels.star_border(self.lo_rad, self.hi_rad, self.length_m, pose.x_m, pose.y_m, pose.yaw_rad)
+        border: F64 = kernels.star_border(star.lo_rad, star.hi_rad, star.length_m, pose.x_m, pose.y_m, pose.yaw_rad)
         return border
 
     def contains(self, points: F64) -> Bool:
         """(N,) which (N, 2) points, virtual sensor frame, were seen to be free."""
-        return self._in_star(points, self.lo_rad, self.hi_rad, anywhere=False)
+        return self._in_star(points, self.star.lo_rad, self.star.hi_rad, anywhere=False)
 
     def looked_at(self, points: F64) -> Bool:
         """(N,) in which directions of (N, 2) points a valid beam looked, whatever it saw there."""
-        return self._in_star(points, self.looked_lo_rad, self.looked_hi_rad, anywhere=True)
+        return self._in_star(points, self.star.looked_lo_rad, self.star.looked_hi_rad, anywhere=True)
 
     def _in_star(self, points: F64, lo_rad: F64, hi_rad: F64, *, anywhere: bool) -> Bool:
         pose = self.virtual_from_sensor
         inside: Bool = kernels.in_star(
-            np.ascontiguousarray(points), pose.x_m, pose.y_m, pose.yaw_rad, lo_rad, hi_rad, self.length_m, anywhere
+            np.ascontiguousarray(points), pose.x_m, pose.y_m, pose.yaw_rad, lo_rad, hi_rad, self.star.length_m, anywhere
         )
         return inside
 
@@ -85,25 +91,21 @@ def median_spacing(bearing_rad: F64) -> float | None:
     return float(np.partition(gaps, [middle - 1, middle])[middle - 1 : middle + 1].mean())
 
 
-def sight_of_beams(
-    bearing_rad: F64, range_m: F64, *, range_max_m: float, spacing_rad: float, virtual_from_sensor: Pose2
-) -> Sight:
+def star_of_beams(bearing_rad: F64, range_m: F64, *, range_max_m: float, spacing_rad: float) -> Star:
     """What a fan of beams has seen. bearing_rad, range_m: (N,) in any order; see mapping.scan for inf and NaN.
 
     A finite range beyond range_max_m is an obstacle where it says, but frees nothing.
     """
     if len(bearing_rad) == 0:
         empty = np.empty(0)
-        return Sight(virtual_from_sensor, empty, empty, empty, empty, empty)
+        return Star(empty, empty, empty, empty, empty)
     ordered, distance = bearing_rad, range_m
-    if not (np.all(bearing_rad[1:] >= bearing_rad[:-1]) and bearing_rad[-1] - bearing_rad[0] < TURN):
+    if not kernels.are_ascending(bearing_rad):
         along = (bearing_rad - bearing_rad[0]) % TURN
         order = np.argsort(along, kind="stable")
         ordered, distance = bearing_rad[0] + along[order], range_m[order]
     gap_max_rad = GAP_MAX_SPACINGS * spacing_rad * (1.0 + 1e-6)
-    lo, hi, length = kernels.thin_sectors(ordered, distance, range_max_m, gap_max_rad, spacing_rad)
-    sees, looked = length > 0.0, ~np.isnan(length)
-    return Sight(virtual_from_sensor, lo[sees], hi[sees], length[sees], lo[looked], hi[looked])
+    return Star(*kernels.thin_sectors(ordered, distance, range_max_m, gap_max_rad, spacing_rad))
 
 
 def sight_of_cone(*, cone_rad: float, free_m: float, near_m: float, virtual_from_transducer: Pose2) -> Sight:
@@ -117,7 +119,7 @@ def sight_of_cone(*, cone_rad: float, free_m: float, near_m: float, virtual_from
     lo, hi, ahead = _cone_pieces(cone_rad, with_front)
     length = np.where(ahead, max(free_m, near_m) if with_front else free_m, near_m)
     sees = (length > 0.0) & np.isfinite(length)
-    return Sight(virtual_from_transducer, lo[sees], hi[sees], length[sees], np.array([-half]), np.array([half]))
+    return Sight(virtual_from_transducer, Star(lo[sees], hi[sees], length[sees], np.array([-half]), np.array([half])))
 
 
 @lru_cache(64)

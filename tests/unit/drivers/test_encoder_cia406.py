@@ -474,11 +474,22 @@ def test_first_reading_follows_from_nothing_and_stamps_lie_between_sync_and_answ
         assert reading.stamp_ns == sync_ns + MS // 4
 
 
+@pytest.mark.parametrize("produce_sync", [True, False])
+def test_positions_by_timer_are_switched_off_where_sync_is_ours(produce_sync: bool) -> None:
+    """On a bus with another master somebody else may live on them."""
+    bench = Bench(Cia406PairConversation(LEFT, RIGHT, produce_sync=produce_sync))
+    bench.run(1000)
+    ids = [int.from_bytes(node.objects[0x1800, 1], "little") for node in bench.nodes]
+    assert [bool(cob_id >> 31) for cob_id in ids] == [produce_sync, produce_sync]
+    assert [cob_id & 0x7FF for cob_id in ids] == [0x180 + node.node for node in bench.nodes]
+
+
 def test_what_is_set_already_is_not_written_again() -> None:
     bench = Bench()
     for node in bench.nodes:
         node.objects[0x1017, 0] = number(100, 2)
         node.objects[0x1801, 2] = b"\1"
+        node.objects[0x1800, 1] = number((1 << 31) | (0x180 + node.node), 4)
     assert bench.run(200)
     assert [node.writes for node in bench.nodes] == [[], []]
 

@@ -14,7 +14,7 @@ from mapping.frames import IDENTITY, Pose2
 from mapping.kernels import sectors as kernels
 from mapping.sectors.footprint import Outline
 from mapping.sectors.rectangular import RectSectors, _Raster
-from mapping.sectors.sight import sight_of_beams
+from mapping.sectors.sight import Sight, star_of_beams
 from mapping.sectors.snapshot import RectSnapshot, SectorState
 
 F64 = NDArray[np.float64]
@@ -178,10 +178,8 @@ def test_free_squares_are_those_no_border_passes_and_whose_corners_are_seen(
     """Square by square, from the star's border and its inside alone."""
     rng = np.random.default_rng(seed)
     bearing = np.sort(rng.uniform(-3.0, 3.0, beams))
-    sight = sight_of_beams(
-        bearing, rng.choice([0.0, 0.4, 1.0, 2.5, math.inf], beams) * rng.uniform(0.5, 1.0), range_max_m=3.0,
-        spacing_rad=0.1, virtual_from_sensor=Pose2(x_m, 0.1, yaw_rad),
-    )  # fmt: skip
+    ranges = rng.choice([0.0, 0.4, 1.0, 2.5, math.inf], beams) * rng.uniform(0.5, 1.0)
+    sight = Sight(Pose2(x_m, 0.1, yaw_rad), star_of_beams(bearing, ranges, range_max_m=3.0, spacing_rad=0.1))
     edges = np.linspace(-1.0, 1.0, 9)
     outline = Outline([[0.3, 0.2], [-0.4, 0.2], [-0.4, -0.2], [0.3, -0.2]], Pose2())
     free = _Raster(edges, edges, 0.25, outline).free(sight).reshape(8, 8)
