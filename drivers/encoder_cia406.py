@@ -11,7 +11,8 @@
 
 Each node: pre-operational -> who are you (1000h, 1018h, 1008h), how do you count (6001h, 6002h) -> heartbeat 100 ms,
 TPDO2 on each SYNC -> start -> TPDO1 off where SYNC is ours (100 frames a second that nobody needs). When both are
-started we send SYNC at the wanted rate; a reading is complete when both have answered the same SYNC. A node that boots, falls silent or leaves the operational state is set up again.
+started we send SYNC at the wanted rate; a reading is complete when both have answered the same SYNC. A node that boots,
+falls silent or leaves the operational state is set up again.
 
 Why not the `canopen` package: it owns threads and the bus; what is needed of CiA 301 here is an SDO client and a few
 ids, which fit a conversation better. The package judges our SDO client in the tests instead.
