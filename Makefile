@@ -31,7 +31,7 @@ demo: venv  ## An emulated robot, the daemon and the live page; prints the addre
 	$(BIN)/umfeld demo $(ARGS)
 
 test: venv lint  ## Everything that must hold: lint, types, arrows, all tests
-	$(PYTEST) -n $(JOBS) --dist loadfile $(ARGS)
+	$(PYTEST) -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: venv  ## ruff, mypy strict, import-linter
 	$(BIN)/ruff check .

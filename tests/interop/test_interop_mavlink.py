@@ -19,6 +19,7 @@ from sim_devices.attach import Attachment, PtyLink
 from sim_devices.device import F64, Mount
 from sim_devices.mavlink_autopilot import MavlinkAutopilot, Rangefinder
 from sim_devices.udp_link import UdpLink
+from tests.waiting import GIVE_UP_S, wait_for
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("pymavlink") is None, reason="needs pymavlink")
 
@@ -65,19 +66,20 @@ def meeting(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Ma
 
 def test_messages_flow_both_ways(meeting: tuple[MavlinkAutopilot, Any]) -> None:
     pilot, host = meeting
-    assert host.recv_match(type="HEARTBEAT", blocking=True, timeout=5).autopilot == 3
+    assert host.recv_match(type="HEARTBEAT", blocking=True, timeout=GIVE_UP_S).autopilot == 3
     for _ in range(3):
         host.mav.heartbeat_send(18, 8, 0, 0, 4)
         host.mav.obstacle_distance_send(0, 0, [100] + [401] * 71, 5, 20, 400, 5.0, 0.0, 12)
         time.sleep(0.1)
-    first = host.recv_match(type="WHEEL_DISTANCE", blocking=True, timeout=5)
-    odometry = host.recv_match(type="ODOMETRY", blocking=True, timeout=5)
-    near = host.recv_match(type="DISTANCE_SENSOR", blocking=True, timeout=5)
+    first = host.recv_match(type="WHEEL_DISTANCE", blocking=True, timeout=GIVE_UP_S)
+    odometry = host.recv_match(type="ODOMETRY", blocking=True, timeout=GIVE_UP_S)
+    near = host.recv_match(type="DISTANCE_SENSOR", blocking=True, timeout=GIVE_UP_S)
     assert first.count == 2
     assert odometry.vx == pytest.approx(0.5, abs=0.01)
     assert near.current_distance == 100
     assert pilot.companion_ns is not None
-    assert (pilot.accepted, pilot.refused) == (3, 0)
+    wait_for("all three", lambda: pilot.accepted == 3)
+    assert pilot.refused == 0
 
 
 @pytest.mark.skipif(importlib.util.find_spec("dronekit") is None, reason="needs dronekit2")

@@ -33,6 +33,7 @@ from sim_devices.encoder_odrive import ODriveAxis
 from sim_devices.encoder_roboclaw import RoboClaw
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.wheel import Side, Wheel
+from tests.waiting import SteadyClock, wait_for
 
 TURN_M = 2.0 * np.pi * 0.1
 
@@ -325,9 +326,10 @@ def test_our_driver_sets_up_and_reads_nodes_of_durand() -> None:
 def test_bridge_by_a_blocking_serial_client(tmp_path: Path) -> None:
     """As the sketch's own Python driver talks: open once at the default rate, again at 57600, then one at a time."""
     board = ArduinoBridge(*pair(1000.0), sonars={7: Sonar(Mount())}, boot_s=0.2, noise_m=0.0)
-    loop = Attachment()
+    clock = SteadyClock()
+    loop = Attachment(clock=clock)
     loop.add("board", board, PtyLink(tmp_path / "board"))
-    with loop:
+    with clock, loop:
         serial.Serial(str(tmp_path / "board")).close()
         with serial.Serial(str(tmp_path / "board"), 57600, timeout=0.5) as port:
 
@@ -343,7 +345,8 @@ def test_bridge_by_a_blocking_serial_client(tmp_path: Path) -> None:
             assert execute("b") == "57600"
             assert execute("r") == "OK"
             assert execute("m 20 20") == "OK"
-            time.sleep(0.3)
+            began_ns = clock()
+            wait_for("three tenths of a second", lambda: clock() > began_ns + 300_000_000)
             left, right = (int(word) for word in execute("e").split())
             assert left == pytest.approx(right, abs=2)
             assert 100 < left < 900
