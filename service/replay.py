@@ -390,7 +390,8 @@ class Replay:
                 for _ in range(place + 1):
                     waiting.popleft()
                 self._guard(partial(self.fusion.stream, source, item, now_ns))
-                self._matched.add(source)
+                if not is_event:  # news come from before the device was set up anew, too
+                    self._matched.add(source)
                 return
         if not self.head.start.complete and source not in self._matched:
             return  # its bytes came before the recording began

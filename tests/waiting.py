@@ -13,6 +13,8 @@ import threading
 import time
 from array import array
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import TypeVar
 
 GIVE_UP_S = 60.0
@@ -78,26 +80,28 @@ def wait_for_input(descriptor: int, count: int) -> None:
 class SteadyClock:
     """Nanoseconds that all but stand still while this process is held up, so that real demands on time can be asked.
 
-    A thread of its own beats every few milliseconds; between two beats the clock goes no farther than MOST_NS, and
-    behind that a thousand times slower (so that two stamps still differ). Devices, drivers and judges that share it
-    are held up together: a process that is stopped for a second has lost 21 ms by it, not 1000. A program that lets
-    a device wait shows as ever, since the beat goes on meanwhile. A context manager; call it for the time.
+    A thread of its own beats every few milliseconds; MOST_NS after a beat the clock goes a thousand times slower (so
+    that two stamps still differ), up to the next one. Devices, drivers and judges that share it are held up together: a
+    process that is stopped for a second has lost 11 ms by it, not 1000. The loop of emulated devices beats as well
+    (`beat`, see BeatStation), since a device that is not served is silent for no fault of its own. Nobody else does: a
+    program that lets a device wait shows as ever. A context manager; call it for the time.
     """
 
-    BEAT_S = 0.004
-    MOST_NS = 20_000_000
+    BEAT_S = 0.003
+    MOST_NS = 10_000_000
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._beat_ns = time.monotonic_ns()
-        self._steady_ns = self._beat_ns
+        self._seen_ns = self._steady_ns = time.monotonic_ns()
+        self._crumbs = 0
+        self._beats = {"clock": self._seen_ns}
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="steady clock", daemon=True)
         self._thread.start()
 
     def __call__(self) -> int:
         with self._lock:
-            return self._steady_ns + self._since_beat(time.monotonic_ns())
+            return self._read()
 
     def __enter__(self) -> SteadyClock:
         return self
@@ -110,16 +114,53 @@ class SteadyClock:
         self._ending.set()
         self._thread.join()
 
-    def _since_beat(self, now_ns: int) -> int:
-        passed_ns = now_ns - self._beat_ns
-        return min(passed_ns, self.MOST_NS) + max(passed_ns - self.MOST_NS, 0) // 1000
+    def beat(self, name: str) -> None:
+        """Somebody who is to be waited for from now on is alive."""
+        with self._lock:
+            self._read()
+            self._beats[name] = self._seen_ns
+
+    def _read(self) -> int:
+        now_ns = time.monotonic_ns()
+        passed_ns = now_ns - self._seen_ns
+        surely_ns = min(max(min(self._beats.values()) + self.MOST_NS - self._seen_ns, 0), passed_ns)
+        crept_ns, self._crumbs = divmod(passed_ns - surely_ns + self._crumbs, 1000)
+        self._steady_ns += surely_ns + crept_ns
+        self._seen_ns = now_ns
+        return self._steady_ns
 
     def _run(self) -> None:
         while not self._ending.wait(self.BEAT_S):
-            with self._lock:
-                now_ns = time.monotonic_ns()
-                self._steady_ns += self._since_beat(now_ns)
-                self._beat_ns = now_ns
+            self.beat("clock")
+
+
+class BeatStation:
+    """Lets a loop of emulated devices (sim_devices.attach) beat a clock whenever it serves them."""
+
+    PERIOD_NS = 3_000_000
+
+    def __init__(self, clock: SteadyClock) -> None:
+        self._clock = clock
+
+    def files(self) -> list[int]:
+        return []
+
+    def service(self, now_ns: int) -> int:
+        self._clock.beat("devices")
+        return now_ns + self.PERIOD_NS
+
+    def plug(self, connected: bool, member: str = "") -> None: ...
+
+    def close(self) -> None: ...
+
+
+def waited_ns(*threads: threading.Thread) -> int:
+    """How long threads of this process were ready to run so far and did not come to it; 0 where that is not told."""
+    total_ns = 0
+    for thread in threads:
+        with suppress(OSError):
+            total_ns += int(Path(f"/proc/self/task/{thread.native_id}/schedstat").read_text().split()[1])
+    return total_ns
 
 
 def seconds_of(clock: Callable[[], int], work: Callable[[], object]) -> float:

@@ -147,7 +147,7 @@ def test_a_robot_maps_loses_its_devices_gets_them_back_and_keeps_its_map(robot: 
         assert Path(saved["path"]).stat().st_size == saved["bytes"]
 
     assert robot.stop(daemon) == 0, robot.log()
-    assert "Traceback" not in robot.log()
+    assert "Traceback" not in robot.log(), robot.log()
     with MapStore.open(robot.folder / "m.umfeld", wall_ns=lambda: 0, read_only=True) as store:
         kept = occupancy_patch(store)
         assert (kept.cells >= 65).sum() > 100
@@ -199,4 +199,4 @@ def test_a_daemon_told_to_stop_while_it_starts_stops(robot: Robot) -> None:
     time.sleep(0.8)  # somewhere in its imports or its start; either way it must end, and without a traceback
     code = robot.stop(daemon)
     assert code in (0, -signal.SIGTERM)
-    assert "Traceback" not in robot.log()
+    assert "Traceback" not in robot.log(), robot.log()

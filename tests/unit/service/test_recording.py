@@ -23,7 +23,7 @@ from service.clock import CrankedClock
 from service.errors import Trouble
 from service.payloads import Message
 from service.recording import Calls, Recorder, Settings, Start, decode_calls, encode_calls, event_of, event_text
-from service.replay import Lost, Recording, Taken
+from service.replay import Lost, Recording, Replay, Taken
 from tests.waiting import wait_for
 
 STAMPS = st.integers(0, 1 << 60)
@@ -286,3 +286,16 @@ def test_who_does_not_record_loads_no_mcap() -> None:
 
     code = "import sys, service.daemon; sys.exit(any(name.startswith(('mcap', 'rosbags')) for name in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0
+
+
+def test_news_before_a_device_is_set_up_anew_do_not_stand_for_its_readings(tmp_path: Path) -> None:
+    """A recording that begins while the daemon runs: silence is told, then a reading is taken that began before it."""
+    desk = Desk(tmp_path)
+    path = desk.begin(complete=False)
+    desk.recorder.sink(lambda _source, _item: None)("front", DeviceEvent(5, LinkState.SILENT, "no reading for 0.1 s"))
+    desk.recorder.call(recording.EVENT, 6, "front", 5)
+    desk.recorder.call(recording.READING, 8, "front", 7)
+    desk.recorder.end()
+    report = Replay(Recording.of(path)).run()
+    assert report.why_not == ["it began while the daemon was running: its first poses are not in it"]
+    assert report.exact is False
