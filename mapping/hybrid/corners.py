@@ -135,10 +135,12 @@ def landmarks(first: I32, link: I32, edge: I32, cost: F64) -> NDArray[np.float32
     nodes = len(first) - 1
     mark = np.empty((nodes, min(LANDMARKS, nodes)), dtype=np.float32)
     row, known = np.empty(nodes, dtype=np.float32), np.zeros(nodes, dtype=np.bool_)
+    if not nodes:
+        return mark
     source, most = 0, 0
     for _ in range(LANDMARKS):
         start = int(np.argmin(known))
-        if not nodes or known[start] or np.count_nonzero(~known) <= most:
+        if known[start] or np.count_nonzero(~known) <= most:
             break
         distances_from(start, first, link, edge, cost, row)
         reached = row < 0.5 * _HUGE

@@ -302,3 +302,21 @@ def test_a_way_of_more_poses_than_there_is_room_for() -> None:
         assert plan.way.length_m == pytest.approx(math.dist(*ends))
         assert plan.way.poses[0, :2] == pytest.approx(ends[0])
         assert plan.way.poses[-1, :2] == pytest.approx(ends[1])
+
+
+def test_space_whose_diagram_has_no_node_is_planned_in_or_refused() -> None:
+    """As a robot's first grids: nothing free yet, a slit of one cell, a disc about it, equally far from all walls."""
+    nothing = np.zeros((40, 40), dtype=np.bool_)
+    slit, disc = nothing.copy(), np.hypot(*(np.indices(nothing.shape) - 20)) < 15
+    slit[20, 5:35] = True
+    for free in (nothing, slit):
+        planner = Planner(VoronoiGrid(free), CELL_M)
+        planner.ready_for(0.2)
+        with pytest.raises(NoWayError):
+            planner.plan(place(20, 10), place(20, 30), clearance_m=0.1)
+    grid = VoronoiGrid(disc)
+    planner = Planner(grid, CELL_M)
+    planner.ready_for(0.1)
+    way = planner.plan(place(20, 10), place(22, 30), clearance_m=0.1).way
+    check_way(way, grid, 0.1)
+    assert way.length_m == pytest.approx(math.dist(place(20, 10), place(22, 30)), rel=0.03)
