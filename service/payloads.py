@@ -46,6 +46,8 @@ from service.topics import Topic
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
+I16 = NDArray[np.int16]
+I8 = NDArray[np.int8]
 
 UPDATE_CELLS_MAX = 32_000  # with the header below 32 KB
 GRID_ATTACHMENT = struct.Struct("<QQ")
@@ -131,8 +133,9 @@ class Encoder:
         self._range_messages = range_messages
         self._scan_stamps: dict[str, int] = {}
         self._beams: dict[str, Beams] = {}
-        self._polar_heads: dict[str, tuple[bytes, list[str]]] = {}
-        self._rect_heads: dict[str, tuple[bytes, list[str]]] = {}
+        self._ranges_forms: dict[str, RangesForm] = {}
+        self._polar_forms: dict[str, SectorForm] = {}
+        self._rect_forms: dict[str, SectorForm] = {}
         self._grid: _GridPlace | None = None
         self.cells_outside = 0  # cells of updates that lay outside their full grid and were not sent
 
@@ -199,20 +202,27 @@ class Encoder:
 
     def _polar(self, out: PolarOut, offset_ns: int) -> Message:
         snap, stamp_ns = out.snapshot, out.snapshot.stamp_ns + offset_ns
-        fingerprint = snap.edges_rad.tobytes()
-        known = self._polar_heads.get(out.name)
-        if known is None or known[0] != fingerprint:
-            known = self._polar_heads[out.name] = (fingerprint, _polar_heads(snap.edges_rad))
-        body = partial(_polar_document, out.name, snap, known[1], out.ground, stamp_ns, self._frames.base)
+        form = self._polar_forms.get(out.name)
+        if form is None or not form.is_of(snap.base_from_sensor, snap.sources, snap.edges_rad):
+            heads = _polar_heads(snap.edges_rad)
+            begin = _document_begin("polar", out.name, self._frames.base, snap.base_from_sensor)
+            form = SectorForm(begin, heads, _POLAR_FIELDS, snap.base_from_sensor, snap.sources, (snap.edges_rad,))
+            self._polar_forms[out.name] = form
+        body = partial(_polar_document, snap, form, out.ground, stamp_ns)
         return Message(topics.POLAR, f"sectors/polar/{out.name}", body, stamp_ns)
 
     def _rect(self, out: RectOut, offset_ns: int) -> Message:
         snap, stamp_ns = out.snapshot, out.snapshot.stamp_ns + offset_ns
-        fingerprint = snap.x_edges_m.tobytes() + b"/" + snap.y_edges_m.tobytes()
-        known = self._rect_heads.get(out.name)
-        if known is None or known[0] != fingerprint:
-            known = self._rect_heads[out.name] = (fingerprint, _rect_heads(snap.x_edges_m, snap.y_edges_m))
-        body = partial(_rect_document, out.name, snap, known[1], stamp_ns, self._frames.base)
+        form = self._rect_forms.get(out.name)
+        if form is None or not form.is_of(snap.base_from_sensor, snap.sources, snap.x_edges_m, snap.y_edges_m):
+            rows, columns = snap.state.shape
+            heads, edges = _rect_heads(snap.x_edges_m, snap.y_edges_m), (snap.x_edges_m, snap.y_edges_m)
+            begin = _document_begin(
+                "rect", out.name, self._frames.base, snap.base_from_sensor, rows=rows, columns=columns
+            )
+            form = SectorForm(begin, heads, _RECT_FIELDS, snap.base_from_sensor, snap.sources, edges)
+            self._rect_forms[out.name] = form
+        body = partial(_rect_document, snap, form, stamp_ns)
         return Message(topics.RECT, f"sectors/rect/{out.name}", body, stamp_ns)
 
     def _odom(self, out: OdomOut, offset_ns: int) -> list[Message]:
@@ -235,7 +245,10 @@ class Encoder:
 
     def _ranges(self, out: RangesOut, offset_ns: int) -> list[Message]:
         stamp_ns = out.stamp_ns + offset_ns
-        document = partial(_ranges_bytes, out, stamp_ns, self._frames.base)
+        form = self._ranges_forms.get(out.sensor)
+        if form is None or not form.is_of(out):
+            form = self._ranges_forms[out.sensor] = RangesForm(out, self._frames.base)
+        document = partial(form.document, out.range_m, stamp_ns)
         messages = [Message(topics.RANGES, f"range/{out.sensor}", document, stamp_ns)]
         if self._range_messages:
             for number in range(1, len(out.range_m) + 1):
@@ -443,30 +456,40 @@ def grid_message(patch: GridPatch, frame: str, frame_from_grid: Pose2, stamp_ns:
     return cdr.Grid(stamp_ns, frame, patch.resolution_m, position, turn, patch.cells)
 
 
-def ranges_document(out: RangesOut, stamp_ns: int, base_frame: str) -> dict[str, object]:
-    """umfeld.ranges.v1."""
-    return {
-        "schema": "umfeld.ranges.v1",
-        "sensor": out.sensor,
-        "stamp": stamp_document(stamp_ns),
-        "frame": base_frame,
-        "cone_rad": _number(out.cone_rad, 5),
-        "range_min_m": _number(out.range_min_m),
-        "range_max_m": _number(out.range_max_m),
-        "transducers": [
-            {
-                "number": number,
-                "pose": pose_document(pose),
-                "status": _range_status(range_m),
-                "range_m": _number(range_m),
-            }
-            for number, (pose, range_m) in enumerate(zip(out.base_from_transducer, out.range_m), start=1)
-        ],
-    }
+class RangesForm:
+    """What is the same in all documents of one chain, umfeld.ranges.v1."""
+
+    def __init__(self, out: RangesOut, base_frame: str) -> None:
+        self._of = _chain_of(out)
+        before = {"schema": "umfeld.ranges.v1", "sensor": out.sensor}
+        after = {
+            "frame": base_frame,
+            "cone_rad": _number(out.cone_rad, 5),
+            "range_min_m": _number(out.range_min_m),
+            "range_max_m": _number(out.range_max_m),
+        }
+        self._before = f'{_json(before)[:-1].decode()},"stamp":'
+        self._after = f',{_json(after)[1:-1].decode()},"transducers":['
+        self._heads = [
+            f'{{"number":{number},"pose":{_json(pose_document(pose)).decode()},"status":"'
+            for number, pose in enumerate(out.base_from_transducer, start=1)
+        ]
+
+    def is_of(self, out: RangesOut) -> bool:
+        """Whether a round has this form."""
+        return self._of == _chain_of(out)
+
+    def document(self, range_m: Sequence[float], stamp_ns: int) -> bytes:
+        """The document of one round. range_m: by transducer."""
+        told = ",".join(
+            f'{head}{_range_status(each)}","range_m":{repr(round(each, 4)) if math.isfinite(each) else "null"}}}'
+            for head, each in zip(self._heads, range_m)
+        )
+        return f"{self._before}{_json(stamp_document(stamp_ns)).decode()}{self._after}{told}]}}".encode()
 
 
-def _ranges_bytes(out: RangesOut, stamp_ns: int, base_frame: str) -> bytes:
-    return _json(ranges_document(out, stamp_ns, base_frame))
+def _chain_of(out: RangesOut) -> tuple[object, ...]:
+    return out.base_from_transducer, out.cone_rad, out.range_min_m, out.range_max_m
 
 
 def _range_bytes(out: RangesOut, number: int, stamp_ns: int) -> bytes:
@@ -597,36 +620,115 @@ def _status_of(source: SourceHealth) -> cdr.Status:
     return cdr.Status(source.level, f"umfeld: {source.name}", source.text or source.state, source.identity, values)
 
 
-# The sector documents go out at up to 40 Hz each: they are written as text, with what never changes kept ready.
+# The sector documents go out at up to 40 Hz each: what never changes is kept ready, the rest is compiled.
+
+_POLAR_FIELDS = (("bearing_rad", 5), ("distance_m", 4), ("clearance_m", 4), ("age_s", 3))
+_RECT_FIELDS = (("x_m", 4), ("y_m", 4), ("distance_m", 4), ("age_s", 3))
+_NO_ROOM = 64  # for what is counted elsewhere
 
 
-def _polar_document(
-    name: str, snap: PolarSnapshot, heads: Sequence[str], ground: SectorGround | None, stamp_ns: int, frame: str
-) -> bytes:
-    text = _document_head("polar", name, stamp_ns, frame, snap.base_from_sensor)
-    sectors = _polar_sectors(snap, heads)
-    if ground is not None:
-        sectors = _with_ground(sectors, ground)
-    return (text + ",".join(sectors) + "]}").encode()
+class _Texts:
+    """Texts one after the other, as compiled code takes them. starts: (N + 1,)."""
+
+    def __init__(self, texts: Sequence[str]) -> None:
+        raw = [text.encode() for text in texts]
+        self.bytes = np.frombuffer(b"".join(raw), dtype=np.uint8).copy()
+        self.starts = np.concatenate(([0], np.cumsum([len(each) for each in raw], dtype=np.int64)))
+        self.longest = max((len(each) for each in raw), default=0)
 
 
-def _rect_document(name: str, snap: RectSnapshot, heads: Sequence[str], stamp_ns: int, frame: str) -> bytes:
-    rows, columns = snap.state.shape
-    text = _document_head("rect", name, stamp_ns, frame, snap.base_from_sensor, rows=rows, columns=columns)
-    return (text + ",".join(_rect_sectors(snap, heads)) + "]}").encode()
+class SectorForm:
+    """What is the same in all documents of one sector map.
+
+    begin: texts before and after the stamp.  heads: each sector up to its state.  fields: names of numbers, and their
+    digits after the point.  edges: what heads were made of.
+    """
+
+    def __init__(
+        self,
+        begin: tuple[str, str],
+        heads: Sequence[str],
+        fields: Sequence[tuple[str, int]],
+        base_from_sensor: Pose2,
+        sources: Sequence[str],
+        edges: tuple[F64, ...],
+    ) -> None:
+        self._before, self._after = (text.encode() for text in begin)
+        self._place, self._sources, self._edges = base_from_sensor, tuple(sources), edges
+        self._heads = _Texts(heads)
+        self._words = _Texts([_STATES[number] for number in range(len(_STATES))] + _source_names(sources))
+        names = [name for name, _ in fields]
+        self._labels = _Texts([f'","{names[0]}":', *(f',"{name}":' for name in names[1:]), ',"source":'])
+        self._digits = np.array([digits for _, digits in fields], dtype=np.int64)
+        self._null = len(_STATES) + len(sources)
+
+    def is_of(self, base_from_sensor: Pose2, sources: Sequence[str], *edges: F64) -> bool:
+        """Whether a snapshot has this form."""
+        if self._place != base_from_sensor or self._sources != tuple(sources):
+            return False
+        return all(ours is theirs or np.array_equal(ours, theirs) for ours, theirs in zip(self._edges, edges))
+
+    def document(
+        self, stamp_ns: int, state: I8, columns: F64, source: I16, ground: SectorGround | None = None
+    ) -> bytes:
+        """The document. columns: (K, N) numbers by field, null where not finite.  source: (N,), negative for none."""
+        from mapping.kernels import texts  # here, for programs that only read what others encode
+
+        count = len(state)
+        room = self._labels.starts[-1] + len(self._digits) * texts.LONGEST + 2 * self._words.longest + _NO_ROOM
+        out = np.empty(len(self._heads.bytes) + count * int(room), dtype=np.uint8)
+        heads, words, labels = self._heads, self._words, self._labels
+        length = texts.write_rows(
+            out, heads.bytes, heads.starts, words.bytes, words.starts, labels.bytes, labels.starts,
+            state, np.ascontiguousarray(columns), self._digits, source, self._null, len(_STATES),
+        )  # fmt: skip
+        sectors = out[:length].tobytes() if length >= 0 else self._slowly(state, columns, source)
+        if ground is not None:  # a sector holds no other object
+            sectors = ",".join(_with_ground(sectors.decode().replace("},{", "}\n{").split("\n"), ground)).encode()
+        seconds, nanos = divmod(stamp_ns, _NANOS)
+        stamp = b'{"sec":%d,"nanosec":%d}' % (seconds, nanos)
+        return b"".join((self._before, stamp, self._after, sectors, b"]}"))
+
+    def _slowly(self, state: I8, columns: F64, source: I16) -> bytes:
+        """The same with numbers larger than compiled code takes, beyond all distances."""
+
+        def text(texts: _Texts, number: int) -> str:
+            return texts.bytes[texts.starts[number] : texts.starts[number + 1]].tobytes().decode()
+
+        layouts = [f"%.{digits}f" for digits in self._digits]
+        sectors = []
+        for row, values in enumerate(columns.T.tolist()):
+            numbers = [layout % value if math.isfinite(value) else "null" for layout, value in zip(layouts, values)]
+            parts = [text(self._labels, k) + number for k, number in enumerate(numbers)]
+            name = self._null if source[row] < 0 else len(_STATES) + int(source[row])
+            head = text(self._heads, row) + text(self._words, int(state[row]))
+            sectors.append(f"{head}{''.join(parts)}{text(self._labels, len(numbers))}{text(self._words, name)}}}")
+        return ",".join(sectors).encode()
 
 
-def _document_head(kind: str, name: str, stamp_ns: int, frame: str, origin: Pose2, **more: int) -> str:
-    head = {
-        "schema": "umfeld.sectors.v1",
-        "kind": kind,
-        "name": name,
-        "stamp": stamp_document(stamp_ns),
-        "frame": frame,
-        "origin": pose_document(origin),
-        **more,
-    }
-    return json.dumps(head, separators=(",", ":"), ensure_ascii=False)[:-1] + ',"sectors":['
+def _polar_document(snap: PolarSnapshot, form: SectorForm, ground: SectorGround | None, stamp_ns: int) -> bytes:
+    columns = np.array((snap.bearing_rad, snap.distance_m, snap.clearance_m, _seconds(snap.age_ns)))
+    return form.document(stamp_ns, snap.state, columns, snap.source, ground)
+
+
+def _rect_document(snap: RectSnapshot, form: SectorForm, stamp_ns: int) -> bytes:
+    x, y = snap.x_m.ravel(), snap.y_m.ravel()
+    columns = np.array((x, y, np.hypot(x, y), _seconds(snap.age_ns.ravel())))
+    return form.document(stamp_ns, snap.state.ravel(), columns, snap.source.ravel())
+
+
+def _seconds(age_ns: I64) -> F64:
+    """NaN where there is no age."""
+    seconds = age_ns / _NANOS
+    seconds[age_ns < 0] = np.nan
+    return seconds
+
+
+def _document_begin(kind: str, name: str, frame: str, origin: Pose2, **more: int) -> tuple[str, str]:
+    before = {"schema": "umfeld.sectors.v1", "kind": kind, "name": name}
+    after = {"frame": frame, "origin": pose_document(origin), **more}
+    texts = [json.dumps(each, separators=(",", ":"), ensure_ascii=False)[1:-1] for each in (before, after)]
+    return f'{{{texts[0]},"stamp":', f',{texts[1]},"sectors":['
 
 
 def _polar_heads(edges_rad: F64) -> list[str]:
@@ -634,23 +736,6 @@ def _polar_heads(edges_rad: F64) -> list[str]:
     return [
         f'{{"index":{i},"start_rad":{a:.6f},"stop_rad":{b:.6f},"center_rad":{(a + b) / 2.0:.6f},"state":"'
         for i, (a, b) in enumerate(pairwise(edges))
-    ]
-
-
-def _polar_sectors(snap: PolarSnapshot, heads: Sequence[str]) -> list[str]:
-    names = _source_names(snap.sources)
-    return [
-        f'{head}{_STATES[state]}","bearing_rad":{bearing},"distance_m":{distance},"clearance_m":{clearance},'
-        f'"age_s":{age},"source":{names[source]}}}'
-        for head, state, bearing, distance, clearance, age, source in zip(
-            heads,
-            snap.state.tolist(),
-            _texts(snap.bearing_rad, "%.5f"),
-            _texts(snap.distance_m, "%.4f"),
-            _texts(snap.clearance_m, "%.4f"),
-            _ages(snap.age_ns),
-            snap.source.tolist(),
-        )
     ]
 
 
@@ -677,22 +762,6 @@ def _rect_heads(x_edges_m: F64, y_edges_m: F64) -> list[str]:
     ]
 
 
-def _rect_sectors(snap: RectSnapshot, heads: Sequence[str]) -> list[str]:
-    names = _source_names(snap.sources)
-    return [
-        f'{head}{_STATES[state]}","x_m":{x},"y_m":{y},"distance_m":{distance},"age_s":{age},"source":{names[source]}}}'
-        for head, state, x, y, distance, age, source in zip(
-            heads,
-            snap.state.ravel().tolist(),
-            _texts(snap.x_m.ravel(), "%.4f"),
-            _texts(snap.y_m.ravel(), "%.4f"),
-            _texts(np.hypot(snap.x_m, snap.y_m).ravel(), "%.4f"),
-            _ages(snap.age_ns.ravel()),
-            snap.source.ravel().tolist(),
-        )
-    ]
-
-
 def _source_names(sources: Sequence[str]) -> list[str]:
     """JSON text by source index; the last entry, which index -1 finds, is null."""
     return [*(json.dumps(name) for name in sources), "null"]
@@ -700,9 +769,3 @@ def _source_names(sources: Sequence[str]) -> list[str]:
 
 def _texts(values: F64, layout: str) -> list[str]:
     return [layout % value if value - value == 0.0 else "null" for value in values.tolist()]  # inf, NaN: null
-
-
-def _ages(age_ns: I64) -> list[str]:
-    ages = age_ns.tolist()  # one stamp stands for many sectors
-    texts = {age: "%.3f" % (age / _NANOS) if age >= 0 else "null" for age in set(ages)}
-    return [texts[age] for age in ages]

@@ -37,6 +37,8 @@ from drivers.readings import (
 from service import assemble, assemble_makers
 from service.config import Config, from_document
 from service.fusion import Fusion, OdometryOnly
+from service.outputs import PolarOut, RectOut
+from service.payloads import Encoder
 from service.sensors import AxleEncoder, Chain, Contacts, Laser, PoseSource, Ring, Sensor, Wheels
 
 _LOG = logging.getLogger(__name__)
@@ -241,6 +243,7 @@ def _footprint(config: Config) -> None:
 
 def _fusion(config: Config, found: dict[str, Sensor]) -> None:
     fusion = Fusion(assemble.parts(config, found, assemble.maps(config, found), OdometryOnly()))
+    encoder = Encoder()
     now_ns = 0
     for step in range(4):  # standing, then moving: the two take different kernels
         now_ns += 100_000_000
@@ -249,7 +252,9 @@ def _fusion(config: Config, found: dict[str, Sensor]) -> None:
         for name, sensor in found.items():
             if isinstance(sensor, Wheels):
                 fusion.on_item(name, WheelReading(now_ns + 50_000_000, 100 * step, -100 * step, True), now_ns)
-        fusion.tick(now_ns + 60_000_000)
+        for output in fusion.tick(now_ns + 60_000_000):
+            if isinstance(output, PolarOut | RectOut):
+                assert all(message.payload for message in encoder.encode(output, 0))
 
 
 def _pretended(sensor: Sensor, step: int, now_ns: int) -> Reading:
