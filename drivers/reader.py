@@ -562,9 +562,10 @@ class _Source(Generic[WireT]):
         self._sink(self.name, DeviceEvent(now_ns, state, text, news[2]))
         good = state in (LinkState.STARTING, LinkState.RUNNING) or text == _WORDS[LinkState.SILENT]
         level = logging.INFO if good else logging.WARNING
-        is_said = self._log.say(
-            now_ns, f"{self.name}: {state.name}", level, f"{self.name}: {state.name.lower()}: {text}"
-        )
+        cause = f"{self.name}: {state.name}"
+        if not good:  # a start in silence is no reason to keep the first true one back, nor "no reading" what is wrong
+            cause += ", told by the loop" if text == self._loop_trouble else ", told by the device"
+        is_said = self._log.say(now_ns, cause, level, f"{self.name}: {state.name.lower()}: {text}")
         if is_said and not good:  # whoever reads of the trouble reads of its end, too
             self._log.forget(f"{self.name}: {LinkState.RUNNING.name}")
 

@@ -527,8 +527,26 @@ def test_the_log_has_one_line_per_cause_per_minute(caplog: pytest.LogCaptureFixt
         bench.run_until(90_000)
     lines = [record.getMessage() for record in caplog.records]
     assert len(bench.events()) > 100
-    assert len(lines) <= 5, "twice each, and running again after the trouble that was told"
+    assert len(lines) <= 6, "twice each, the start in silence, and running again after the trouble that was told"
     assert any("times more" in line for line in lines)
+
+
+def test_the_log_has_the_first_silence_soon_after_a_start_in_silence(caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench()
+    with caplog.at_level(logging.INFO):
+        bench.run_until(1_000)
+        bench.say_from_to(1_000, 2_000)
+        bench.run_until(2_400)
+        bench.talker.trouble = "the left node does not answer"
+        bench.run_until(5_000)
+        bench.talker.trouble = None
+        bench.say_from_to(5_000, 6_000)
+        bench.run_until(5_500)
+    lines = [record.getMessage() for record in caplog.records if record.name == "drivers.reader"]
+    assert [line.split(": ")[1] for line in lines] == ["silent", "running", "silent", "silent", "running"]
+    assert "no answer yet" in lines[0]
+    assert "no reading for" in lines[2]
+    assert "the left node does not answer" in lines[3]
 
 
 def test_the_tap_hears_everything_in_order() -> None:
