@@ -70,10 +70,9 @@ def distances_m(snapshot: PolarSnapshot, range_max_m: float, footprint: ArrayLik
     return _from_another_origin(snapshot, range_max_m, footprint)
 
 
-def free_reach_m(snapshot: PolarSnapshot) -> float:
-    """The farthest that a free sector was seen free; 0 if none is."""
-    free = snapshot.state == SectorState.FREE
-    return float(snapshot.distance_m[free].max()) if free.any() else 0.0
+def seen_reach_m(snapshot: PolarSnapshot) -> float:
+    """The farthest that was looked in any sector, free or up to an obstacle; 0 if nowhere."""
+    return float(_known_free_m(snapshot).max(initial=0.0))
 
 
 def _known_free_m(snapshot: PolarSnapshot) -> F64:
@@ -187,7 +186,7 @@ class Talker:
         self._settings = settings
         self._sequence = 0
         self._heartbeat_ns: int | None = None
-        self._seen_free_m = 0.0
+        self._seen_m = 0.0
 
     def frames(self, snapshot: PolarSnapshot | None, now_ns: int) -> list[bytes]:
         """The frames that are due on a beat at now_ns. snapshot: the newest, None before the first."""
@@ -203,8 +202,8 @@ class Talker:
         settings = self._settings
         min_cm = max(1, math.ceil(settings.range_min_m * 100.0 - 1e-6))
         if snapshot is not None:
-            self._seen_free_m = max(self._seen_free_m, free_reach_m(snapshot))
-        range_max_m = min(settings.range_max_m, self._seen_free_m or settings.range_max_m)
+            self._seen_m = max(self._seen_m, seen_reach_m(snapshot))
+        range_max_m = min(settings.range_max_m, self._seen_m or settings.range_max_m)
         max_cm = min(max(math.floor(range_max_m * 100.0 + 1e-6), min_cm + 1), _FARTHEST_CM)
         if snapshot is None or now_ns - snapshot.stamp_ns > _STALE_NS:
             known = np.full(ELEMENTS, np.nan)

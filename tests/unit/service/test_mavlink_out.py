@@ -30,7 +30,7 @@ from service.mavlink_out import (
     Talker,
     distances_cm,
     distances_m,
-    free_reach_m,
+    seen_reach_m,
     sensor_type_of,
 )
 from service.outputs import PolarOut
@@ -196,7 +196,8 @@ def test_centimetres_are_never_more_than_there_are() -> None:
 
 def test_sensor_type_is_that_of_what_feeds_the_map() -> None:
     assert [sensor_type_of(kinds) for kinds in (["laser", "laser"], ["sonar"], ["laser", "sonar"], [])] == [0, 1, 4, 4]
-    assert free_reach_m(snapshot([UNKN, OBST], [1.0, 2.0])) == 0.0
+    assert seen_reach_m(snapshot([UNKN, STAL], [1.0, 2.0])) == 0.0
+    assert seen_reach_m(snapshot([UNKN, OBST, FREE], [9.0, 2.0, 1.0])) == 2.0
 
 
 # --- bytes
@@ -253,6 +254,18 @@ def test_old_maps_and_none_are_unknown_the_beat_goes_on() -> None:
         message = parsed(talker.frames(snap, now_ns))[-1]
         told.append(set(message.distances))  # type: ignore[attr-defined]
     assert told == [{UNKNOWN}, {1001}, {1001}, {UNKNOWN}]
+
+
+def test_in_a_room_the_limit_is_its_farthest_wall_not_the_reach_of_a_beam_along_glass() -> None:
+    """A laser in a flat: walls all around, and two sectors that are free up to where their beams grazed something."""
+    states, reach = [OBST] * 72, [4.0] * 72
+    reach[36] = 6.95
+    states[20], reach[20] = FREE, 1.29
+    message = parsed(Talker(Settings("laser", BODY)).frames(snapshot(states, reach), SECOND))[-1]
+    assert message.max_distance == 695  # type: ignore[attr-defined]
+    told = list(message.distances)  # type: ignore[attr-defined]
+    assert told.count(400) >= 68
+    assert 696 not in told
 
 
 def test_the_limit_is_what_the_sensors_see() -> None:
