@@ -71,6 +71,8 @@ class ColaProfile:
     """What one model is and says of itself. Angles in degrees of the device, where 90 looks ahead.
 
     steps: resolution in 1/10000 degree for each scan rate in 1/100 Hz that it can have; the first is its default.
+    scan_config: what scans contain as delivered, the 12 numbers of LMDscandatacfg: channels (2), strength, in 16 bits,
+    its unit, encoders (2), position, name, comment, time, every n-th.
     """
 
     name: str
@@ -82,16 +84,17 @@ class ColaProfile:
     steps: tuple[tuple[int, int], ...]
     range_min_m: float
     range_max_m: float
-    rssi_bits: int
-    sends_time: bool
+    scan_config: tuple[int, ...]
 
 
 TIM571 = ColaProfile(
-    "TiM571", "V1.13-22.03.19", "1079742", 18480390, -45.0, 225.0, ((1500, 3333),), 0.05, 25.0, 16, True
-)
+    "TiM571", "V1.13-22.03.19", "1079742", 18480390, -45.0, 225.0, ((1500, 3333),), 0.05, 25.0,
+    (1, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 1),
+)  # fmt: skip
 LMS111 = ColaProfile(
-    "LMS111", "V1.36-21.10.2010", "1041114", 10440118, -45.0, 225.0, ((5000, 5000), (2500, 2500)), 0.05, 20.0, 8, False
-)
+    "LMS111", "V1.36-21.10.2010", "1041114", 10440118, -45.0, 225.0, ((5000, 5000), (2500, 2500)), 0.05, 20.0,
+    (1, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 1),
+)  # fmt: skip
 COLA_PROFILES = {"tim571": TIM571, "lms111": LMS111}
 
 
@@ -214,7 +217,7 @@ class SickColaLaser:
         self._variables: dict[tuple[str, bool], bytes] = {}  # by name and dialect
         self._rate, self._step = profile.steps[0]
         self._range = self._whole_range
-        self._config = [1, 0, 1, profile.rssi_bits == 16, 0, 0, 0, 0, 0, 0, int(profile.sends_time), 1]
+        self._config = list(profile.scan_config)
         self._methods: dict[str, Callable[[_Request, int], None]] = {
             "SetAccessMode": self._log_in,
             "Run": self._run,

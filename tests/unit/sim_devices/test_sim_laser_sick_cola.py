@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import os
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ MS = 1_000_000
 SECOND = 1_000_000_000
 
 LOGIN = b"sMN SetAccessMode \x03\xf4\x72\x47\x44"
+AS_RECORDED = replace(TIM571, scan_config=(1, 0, 1, 1, 0, 0, 0, 0, 0, 0, 1, 1))  # strength in 16 bits, time
 SUBSCRIBE, UNSUBSCRIBE = b"sEN LMDscandata \x01", b"sEN LMDscandata \x00"
 
 
@@ -294,7 +295,7 @@ def test_beams_are_measured_as_the_mirror_turns() -> None:
 
 
 def test_what_is_no_distance_has_a_code_and_no_strength() -> None:
-    bench = Bench([1.0, 0.02, np.inf, 26.0, np.nan, -np.inf, 24.9])
+    bench = Bench([1.0, 0.02, np.inf, 26.0, np.nan, -np.inf, 24.9], profile=AS_RECORDED)
     _, rssi = (channel[4][:7] for channel in taken_apart(bench.scans(0.2)[0]).wide)
     values = taken_apart(bench.scans(0.2)[0]).wide[0][4][:7]
     assert list(values) == [1000, 2, 0, 0, 1, 2, 24900]
@@ -306,8 +307,9 @@ def test_text_scan_says_the_same_as_a_binary_one() -> None:
     words = bench.say("sRN LMDscandata").split()
     assert words[:5] == ["sRA", "LMDscandata", "1", "1", "119FD06"]
     at = words.index("DIST1")
-    assert words[at - 4 : at + 6] == ["5DC", "A2", "0", "2", "DIST1", "3F800000", "00000000", "FFF92230", "D05", "32B"]
+    assert words[at - 4 : at + 6] == ["5DC", "A2", "0", "1", "DIST1", "3F800000", "00000000", "FFF92230", "D05", "32B"]
     assert [int(word, 16) for word in words[at + 6 : at + 6 + 811]] == list(range(1000, 1811))
+    assert words[at + 817 :] == ["0", "0", "1", "B", "not", "defined", "0", "0", "0"], "no strength; its name"
     out = bench.raw(b"\x02sEN LMDscandata 1\x03", 0.2)
     assert out.startswith(b"\x02sEA LMDscandata 1\x03\x02sSN LMDscandata 1 1 119FD06 ")
 
@@ -387,7 +389,7 @@ def test_scans_have_the_layout_of_recorded_ones() -> None:
     for payload in binary_payloads(whole)[::30]:
         told = taken_apart(payload)
         ranges_m = np.where(told.wide[0][4] > 20, told.wide[0][4] * 1e-3, np.inf)
-        ours_payload = Bench(ranges_m, profile=TIM571, serial=told.head[2]).scans(0.1)[0]
+        ours_payload = Bench(ranges_m, profile=AS_RECORDED, serial=told.head[2]).scans(0.1)[0]
         ours = taken_apart(ours_payload)
         assert len(ours_payload) == len(payload)
         assert (told.rest, ours.rest) == (b"", b"")
