@@ -1,7 +1,7 @@
 """Other people's laser drivers on the emulated lasers, over ptys and TCP, held against the room they stand in.
 
 Packages: pyrplidarsdk (the maker's SDK), rplidar-roboticia or one of its heirs (rplidar-sharpattack, rplidar-mrumel,
-rplidar), adafruit-rplidar, pyrplidar, lds2d, hokuyolx, sick-scan-tcp. Programs, if they are on the PATH:
+rplidar), adafruit-rplidar, pyrplidar, rplidarc1, robot-hat, lds2d, hokuyolx, sick-scan-tcp. Programs, if they are on the PATH:
 lms2xx_simple_app and lms2xx_set_variant (sicktoolbox), ldlidar_stl_node (ldlidar_stl_sdk), ultra_simple (rplidar_sdk),
 sick_generic_caller (sick_scan_xd, built without ROS; its launch files in the folder named by SICK_SCAN_LAUNCH),
 rawlog-grabber and rawlog-edit (mrpt-apps), the C samples of urg_library in the folder named by URG_SAMPLES.
@@ -12,6 +12,7 @@ And the other way round: other people's emulators under our drivers, urg_sim (ur
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import importlib
 import importlib.util
@@ -95,8 +96,9 @@ def mean_error_m(clockwise_deg: list[float], range_m: list[float]) -> float:
 
 @pytest.fixture
 def no_modem_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pty has no DTR; drivers that insist on it believe it was set."""
+    """A pty has no DTR and no RTS; drivers that insist on them believe they were set."""
     monkeypatch.setattr(serial.Serial, "_update_dtr_state", lambda self: None)
+    monkeypatch.setattr(serial.Serial, "_update_rts_state", lambda self: None)
 
 
 # -- RPLIDAR -----------------------------------------------------------------------------------------------------------
@@ -186,6 +188,42 @@ def test_pyrplidar_reads_all_kinds_of_scans(tmp_path: Path) -> None:
             time.sleep(0.3)
             reader.lidar_serial._serial.reset_input_buffer()
         reader.disconnect()
+
+
+@needs("rplidarc1")
+@pytest.mark.usefixtures("no_modem_lines")
+def test_rplidarc1_reads_samples(tmp_path: Path) -> None:
+    """Made for the C1, which begins with the same standard scan."""
+
+    async def read(port: str) -> list[dict[str, Any]]:
+        reader = importlib.import_module("rplidarc1").RPLidar(port, 115200)
+        scanning = asyncio.create_task(reader.simple_scan())
+        await asyncio.sleep(2.0)
+        reader.stop_event.set()
+        await scanning
+        reader.shutdown()
+        return [reader.output_queue.get_nowait() for _ in range(reader.output_queue.qsize())]
+
+    with on_a_pty(RpLidar(Room()), tmp_path / "laser") as port:
+        samples = asyncio.run(read(port))
+    assert len(samples) > 1000
+    seen = [sample for sample in samples if sample["d_mm"]]
+    assert mean_error_m([each["a_deg"] for each in seen], [each["d_mm"] * 1e-3 for each in seen]) < NOISE_M
+
+
+@needs("robot_hat")
+@pytest.mark.usefixtures("no_modem_lines")
+def test_robot_hat_reads_samples(tmp_path: Path) -> None:
+    settings = importlib.import_module("robot_hat.data_types.config.lidar").RPLidarC1Config
+    make = importlib.import_module("robot_hat.sensors.lidar.rplidar_c1").RPLidarC1
+    with on_a_pty(RpLidar(Room()), tmp_path / "laser") as port, make(settings(port=port, baudrate=115200)) as reader:
+        assert reader.get_device_info().firmware_version == "1.29"
+        assert reader.get_health().status.value == "ok"
+        reader.start_scan()
+        samples = list(itertools.islice(reader.iter_measurements(), 1500))
+        reader.stop_scan()
+    clockwise_deg = [-each.angle_deg for each in samples]
+    assert mean_error_m(clockwise_deg, [each.distance_m for each in samples]) < NOISE_M
 
 
 @needs("lds2d")

@@ -1,5 +1,6 @@
 """Other people's MAVLink on the emulated autopilot: pymavlink's connections, on which most ground tools stand; mavsdk
-(4 or later), which asks for version, parameters and rates as ground stations do; dronekit2."""
+(4 or later), which asks for version, parameters and rates as ground stations do; dronekit2; mavio, which has its own
+codec and asks what a board is; mavping."""
 
 from __future__ import annotations
 
@@ -7,6 +8,8 @@ import importlib
 import importlib.util
 import os
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -98,6 +101,34 @@ def test_dronekit_is_ready_with_all_that_it_waits_for(tmp_path: Path) -> None:
             assert vehicle.mode.name == "MANUAL"
         finally:
             vehicle.close()
+
+
+def said_on_a_line(command: list[str], path: Path, seconds: float) -> str:
+    """What a program says that was given the emulated autopilot's serial port."""
+    pilot = MavlinkAutopilot(Rolling(), line_rate_bps=57600, rangefinders=[Rangefinder(0, Mount())])
+    loop = Attachment()
+    loop.add("pilot", pilot, PtyLink(path))
+    with loop:
+        return subprocess.run(
+            [str(Path(sys.executable).with_name(command[0])), *command[1:]],
+            capture_output=True, text=True, timeout=seconds, check=False,
+        ).stdout  # fmt: skip
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mavping") is None, reason="needs mavping")
+def test_mavping_hears_the_clock(tmp_path: Path) -> None:
+    port = str(tmp_path / "pilot")
+    said = said_on_a_line(
+        ["mavping", "--port", port, "--baud", "57600", "--count", "4", "--interval", "0.2"], tmp_path / "pilot", 30.0
+    )
+    assert "Successful: 4" in said
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mavio") is None, reason="needs mavio")
+def test_mavio_finds_out_what_it_is(tmp_path: Path) -> None:
+    said = said_on_a_line(["mavio", "probe", str(tmp_path / "pilot"), "--baud", "57600"], tmp_path / "pilot", 60.0)
+    assert "GROUND_ROVER / ArduPilot" in said
+    assert "ArduPilot 4.5.0" in said
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mavsdk") is None, reason="needs mavsdk")
