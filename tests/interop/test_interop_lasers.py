@@ -2,9 +2,10 @@
 
 Packages: pyrplidarsdk (the maker's SDK), rplidar-roboticia or one of its heirs (rplidar-sharpattack, rplidar-mrumel,
 rplidar), adafruit-rplidar, pyrplidar, rplidarc1, robot-hat, lds2d, hokuyolx, sick-scan-tcp. Programs, if they are on
-the PATH: lms2xx_simple_app and lms2xx_set_variant (sicktoolbox), ldlidar_stl_node (ldlidar_stl_sdk), ultra_simple (rplidar_sdk),
-sick_generic_caller (sick_scan_xd, built without ROS; its launch files in the folder named by SICK_SCAN_LAUNCH),
-rawlog-grabber and rawlog-edit (mrpt-apps), the C samples of urg_library in the folder named by URG_SAMPLES.
+the PATH: lms2xx_simple_app and lms2xx_set_variant (sicktoolbox), ldlidar_stl_node (ldlidar_stl_sdk), ultra_simple
+(rplidar_sdk), sick_generic_caller (sick_scan_xd, built without ROS; its launch files in the folder named by
+SICK_SCAN_LAUNCH), rawlog-grabber and rawlog-edit (mrpt-apps), the C samples of urg_library in the folder named by
+URG_SAMPLES.
 
 And the other way round: other people's emulators under our drivers, urg_sim (urg_stamped) and SICK's own test server
 (SICK_TEST_SERVER names its test_server.py, in sick_scan_xd).
