@@ -31,6 +31,7 @@ KEY = "map/agreement"
 _TOLD_MOST = 50
 _SAME_M = 0.5
 _NS_PER_SAMPLE = 1500
+_PER_PAIR = 0.7  # of a door or way and a wall, in samples
 _SHARE = 0.01
 
 KINDS = {
@@ -124,6 +125,7 @@ class AgreementMaker:
             verdict = agreement.passages_in(grid, found.door_ends_m)
             yield _Judged("door_is_blocked", verdict, middles, between.__getitem__)
             if walls is not None:
+                self._samples += round(_PER_PAIR * len(found.door_ends_m) * len(walls))
                 verdict = agreement.walled_passages(found.door_ends_m, walls.start_m, walls.end_m)
                 yield _Judged("door_is_walled", verdict, middles, between.__getitem__)
             patch, labels, numbers = found.patch, found.labels, found.numbers
@@ -141,8 +143,10 @@ class AgreementMaker:
             joined = [(centre_of[each.a], centre_of[each.b]) for each in regions.passages]
             ways = np.array([(a, middle, b) for (a, b), middle in zip(joined, middles)]).reshape(-1, 3, 2)
             names = [f"passage {each.a} - {each.b}" for each in regions.passages]
+            self._samples += round(float(np.hypot(*np.diff(ways, axis=1).T).sum()) / grid.resolution_m)
             yield _Judged("way_is_blocked", agreement.ways_in(grid, ways), middles, names.__getitem__)
             if walls is not None:
+                self._samples += round(_PER_PAIR * len(ways) * len(walls))
                 verdict = agreement.crossed_ways(ways, walls.start_m, walls.end_m)
                 yield _Judged("way_is_walled", verdict, middles, names.__getitem__)
 

@@ -125,6 +125,22 @@ def test_large_maps_are_compared_less_often() -> None:
     assert maker.period_ns == 15_000_000_000
 
 
+def test_all_that_is_compared_is_counted_as_work() -> None:
+    rooms, topo, lines = RoomMaker(settle_turns=1), TopoMaker(smooth_m=0.2), LineMaker(LineMap(), ["front"])
+    rooms.make(view(house()))
+    topo.make(view(house()))
+    with_lines(lines, [[5.5, 0.6, 5.5, 2.5], [5.5, 3.5, 5.5, 5.4]])
+    work = []
+    for some in ({"lines": lines}, {"topo": topo}, {"lines": lines, "rooms": rooms}, {"lines": lines, "topo": topo}):
+        maker = AgreementMaker(**some)
+        maker.make(view(house()))
+        work.append(maker._samples)
+    assert work[0] > 0
+    assert work[1] > 0
+    assert work[2] > work[0]
+    assert work[3] > work[0] + work[1]
+
+
 def test_it_is_built_after_the_maps_it_compares() -> None:
     config = Config.model_validate({"lasers": {"front": {"driver": "hokuyo", "port": "/dev/none"}}})
     names = [maker.name for maker in assemble_makers.map_makers(config, assemble.sensors(config))]
