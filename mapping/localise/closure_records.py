@@ -27,7 +27,9 @@ class ClosureSettings:
     explained, overlap, mean_cost: of the points, see Agreement and Match; half_*: what still has half a vote.
     weakest_per_m2: least information in the worst direction.  rough_*: what still has rough_worth of a vote: outdoors
     nothing is a plane and little holds a pose, but nearly all that was seen is seen again.  rough_weight: what one
-    needs in the graph with the group it came with.
+    needs in the graph with the group it came with.  faint_*: what has faint_worth only, and counts where many agree
+    over faint_way_m: half of the points, where surfaces are rough (they fit no better than mean_cost): what is plain
+    repeats, hedges and parked cars do not.
     surprise: squared Mahalanobis distance of a searched closure, by the covariance along the way, beyond which nothing
     explains it; held_m: steps less sure than that are held by the wheels alone, see Uncertainty.
     agreeing: searched closures that must ask for the same correction, over at least agreeing_way_m of the way,
@@ -65,6 +67,10 @@ class ClosureSettings:
     rough_weakest_per_m2: float = 250.0
     rough_worth: float = 0.34
     rough_weight: float = 0.65
+    faint_explained: float = 0.50
+    faint_weakest_per_m2: float = 150.0
+    faint_worth: float = 0.17
+    faint_way_m: float = 12.0
     surprise: float = 12.0
     held_m: float = 0.0115
     expected: float = 6.25

@@ -55,10 +55,12 @@ from mapping.localise.scan_match import (
     weakest_information,
 )
 from mapping.localise.search import APART_M, APART_RAD, find_view, raster_of
+from mapping.localise.views import View
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
+ASIDE = 0.5  # cosine: keys that look more than 60 degrees away
 REFINING = Reach((0.40, 0.28, 0.20, 0.15), (0.12, 0.08, 0.06, 0.04))
 
 
@@ -197,6 +199,16 @@ class Work:
         off = self.snapshot.poses[rows] - np.array([pose.x_m, pose.y_m, pose.yaw_rad])
         return int(rows[np.argmin(np.hypot(off[:, 0], off[:, 1]) + 1.0 - np.cos(off[:, 2]))])
 
+    def _seeing(self, view: View, key: int, rows: I64, pose: Pose2) -> int:
+        """Of keys (R,), the one around which most was seen of what a view at a pose sees: a laser that looks ahead sees
+        a street's houses from one side only, and the same ones from farther on where it drives the other way."""
+        shot = self.snapshot
+        seen = []
+        for place in rows.tolist():
+            around = self._around(place, key, self.settings.place_m, 16)
+            seen.append(agreement(view, shot.views, around, shot.poses[around], pose).explained)
+        return int(rows[int(np.argmax(seen))])
+
     def _around(self, place: int, key: int, reach_m: float, most: int) -> I64:
         """Keys within reach_m along the way of a place, evenly thinned to `most`; the place itself is one."""
         travel = self.snapshot.travel_m
@@ -240,6 +252,8 @@ class Work:
                 continue
             if reach_m > s.place_m:
                 place = self._nearest(place, key, reach_m, spot.pose)
+                if math.cos(shot.poses[place, 2] - spot.pose.yaw_rad) < ASIDE:
+                    place = self._seeing(view, key, rows, spot.pose)
                 rows = self._around(place, key, s.place_m, 16)
             match = match_view(view, shot.views, rows, shot.poses[rows], spot.pose, reach=REFINING)
             closure = self._judged(key, place, rows, match, spot.pose, 0.6, searched=True)
@@ -307,8 +321,12 @@ class Work:
                 return 1.0
             if explained >= s.half_explained and overlap >= s.half_overlap and mean_cost <= s.half_mean_cost:
                 return 0.5
-        is_rough = explained >= s.rough_explained and overlap >= s.rough_overlap and mean_cost <= s.rough_mean_cost
-        return s.rough_worth if is_rough and weakest_per_m2 >= s.rough_weakest_per_m2 else 0.0
+        if overlap < s.rough_overlap or mean_cost > s.rough_mean_cost:
+            return 0.0
+        if explained >= s.rough_explained and weakest_per_m2 >= s.rough_weakest_per_m2:
+            return s.rough_worth
+        is_faint = explained >= s.faint_explained and mean_cost >= s.mean_cost
+        return s.faint_worth if is_faint and weakest_per_m2 >= s.faint_weakest_per_m2 else 0.0
 
     # --- probation
 
@@ -327,13 +345,20 @@ class Work:
         surprise = float(np.median([pending[k].surprise for k in best]))
         doubt = 1.0 + max(0.0, surprise - s.expected) / s.doubling
         way = [float(travel[pending[k].to]) for k in best]
-        is_rough = sum(pending[k].worth >= 0.5 for k in best) < 2
-        if votes < doubt * s.agreeing or max(way) - min(way) < doubt * (
-            s.rough_way_m if is_rough else s.agreeing_way_m
-        ):
+        needed_m = doubt * self._way_needed([pending[k] for k in best], doubt * s.agreeing)
+        if votes < doubt * s.agreeing or max(way) - min(way) < needed_m:
             return [], pending
         chosen = set(best)
         return [pending[k] for k in best], [c for k, c in enumerate(pending) if k not in chosen]
+
+    def _way_needed(self, group: list[Closure], votes: float) -> float:
+        """Over how much of the way a group must agree: the more if it has not as many votes without faint ones, or
+        nearly all of its votes are rough."""
+        s = self.settings
+        firm = {closure.to: closure.worth for closure in group if closure.worth > s.faint_worth}
+        if sum(firm.values()) < votes:
+            return s.faint_way_m
+        return s.rough_way_m if sum(worth >= 0.5 for worth in firm.values()) < 2 else s.agreeing_way_m
 
     def _staying(self, group: list[Closure], weight: F64) -> NDArray[np.bool_]:
         """(C,) which of a group that was accepted stay: rough ones only if the others bear them out, unless that were

@@ -31,7 +31,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.frames import IDENTITY, Pose2, compose_covariance, exp_se2, log_se2
+from mapping.frames import IDENTITY, Pose2, compose_covariance, exp_se2, log_se2, wrap_angle
 from mapping.localise.closure_records import (
     Closure,
     ClosureSettings,
@@ -44,6 +44,7 @@ from mapping.localise.closure_records import (
 from mapping.localise.closures import REFINING, Work
 from mapping.localise.kept_places import KeptPlaces
 from mapping.localise.key_path import KeyPath
+from mapping.localise.odometry_trust import Heading, Trust
 from mapping.localise.pose_graph import composed_poses
 from mapping.localise.scan_match import Match, Reach, agreement, match_view, weakest_information
 from mapping.localise.search import find_view, raster_of
@@ -71,6 +72,9 @@ RESORTED_M = 0.1  # key scans that move more are sorted anew
 CLEARLY = 1.1  # times better a match must be to be believed against the prediction
 CLEARLY_PER_DEVIATION = 0.04  # and so much more for each deviation beyond the gate
 MOST_BEYOND = 20.0
+LEAST_SHARE = 0.2  # of pairs of points, in a match that can judge
+ROUGH_COST = 0.2  # of a match: hedges and slopes, no walls
+LEAST_RAD = math.radians(0.02)  # what odometry errs in a step, at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,13 +164,15 @@ class _Sensor:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """A predicted pose in the map, its standard deviations, and whether odometry says so."""
+    """A predicted pose in the map and its standard deviations; step: what odometry says the base moved, if it is from
+    there, before bias_rad, which it is known to turn too little, was put on."""
 
     map_from_sensor: Pose2
     map_from_base: Pose2
     sigma_m: float
     sigma_rad: float
-    by_odometry: bool
+    step: Pose2 | None = None
+    bias_rad: float = 0.0
 
     def information(self) -> F64:
         """(3, 3) of x, y, yaw."""
@@ -176,40 +182,6 @@ class _Place:
         """How far another pose is off, in standard deviations: translation, rotation."""
         off = self.map_from_sensor.inverse() @ pose
         return math.hypot(off.x_m, off.y_m) / self.sigma_m, abs(off.yaw_rad) / self.sigma_rad
-
-
-class _Trust:
-    """How much worse odometry is than its model says: running root mean squares, translation and rotation.
-
-    Only steps that move teach, and none by more than five times what was believed: one slip is no character.
-    """
-
-    LEARN = 0.03
-    MOST = 5.0
-    LEAST = 1.0
-    LARGEST = 50.0
-
-    def __init__(self, factor: float) -> None:
-        self._square_m = self._square_rad = factor * factor
-
-    @property
-    def factor_m(self) -> float:
-        """For translations."""
-        return math.sqrt(self._square_m)
-
-    @property
-    def factor_rad(self) -> float:
-        """For rotations."""
-        return math.sqrt(self._square_rad)
-
-    def learn(self, off_m: float, off_rad: float) -> None:
-        """A step was so many (trusted) deviations off."""
-        self._square_m = self._after(self._square_m, off_m)
-        self._square_rad = self._after(self._square_rad, off_rad)
-
-    def _after(self, square: float, off: float) -> float:
-        grown = square * (1.0 + self.LEARN * (min(off, self.MOST) ** 2 - 1.0))
-        return min(max(grown, self.LEAST**2), self.LARGEST**2)
 
 
 class Slam:
@@ -243,7 +215,8 @@ class Slam:
         self._last: tuple[int, Pose2, Pose2 | None] | None = None  # stamp, map_from_base, odom_from_base
         self._velocity: F64 = np.zeros(3)  # a twist of the base in its own frame [m/s, m/s, rad/s]
         self._recent: deque[tuple[int, Pose2]] = deque(maxlen=64)
-        self._trust = _Trust(self.settings.odometry_factor)
+        self._trust = Trust(self.settings.odometry_factor)
+        self._heading = Heading(self.settings.odometry_rad_per_m, self.settings.odometry_turn_share)
         self._lost_scans = 0
         self._key_odom: Pose2 | None = None  # of the sensor, at the newest key scan
         self._key_covariance: F64 = np.zeros((3, 3))
@@ -379,18 +352,20 @@ class Slam:
         """Where the sensor should be: by odometry since the last scan, else by the motion so far."""
         if self._last is None:
             start = self._start or odom_from_base or IDENTITY
-            return _Place(start @ base_from_sensor, start, 1.0, 1.0, False)
+            return _Place(start @ base_from_sensor, start, 1.0, 1.0)
         last_ns, last_pose, last_odom = self._last
         if odom_from_base is not None and last_odom is not None:
             step = last_odom.inverse() @ odom_from_base
             sigma_m, sigma_rad = self._odometry_sigma(math.hypot(step.x_m, step.y_m), abs(step.yaw_rad))
-            return _Place(last_pose @ step @ base_from_sensor, last_pose @ step, sigma_m, sigma_rad, True)
+            bias_rad = self._heading.bias_rad(_along(step), step.yaw_rad)
+            moved = last_pose @ Pose2(step.x_m, step.y_m, step.yaw_rad + bias_rad)
+            return _Place(moved @ base_from_sensor, moved, sigma_m, sigma_rad, step, bias_rad)
         seconds = min(max((stamp_ns - last_ns) * 1e-9, 0.0), 0.5)
         way = self._velocity * seconds
         sigma_m = 0.05 + 2.0 * seconds**2 + 0.3 * math.hypot(way[0], way[1])
         sigma_rad = math.radians(3.0) + 3.0 * seconds**2 + 0.3 * abs(float(way[2]))
         ahead = last_pose @ exp_se2(way)
-        return _Place(ahead @ base_from_sensor, ahead, sigma_m, sigma_rad, False)
+        return _Place(ahead @ base_from_sensor, ahead, sigma_m, sigma_rad)
 
     def _odometry_sigma(self, way_m: float, turn_rad: float) -> tuple[float, float]:
         """Standard deviations of a step by odometry, as far as it is trusted by now."""
@@ -412,7 +387,7 @@ class Slam:
         nothing does. A prediction that pulled all the time would pull into its own errors, which are no noise."""
         rows = self._references(guess.map_from_sensor)
         store, poses = self._views.arrays(), self._poses[rows]
-        match = match_view(view, store, rows, poses, guess.map_from_sensor, prior=0.01 * guess.information())
+        match = free = match_view(view, store, rows, poses, guess.map_from_sensor, prior=0.01 * guess.information())
         if match is None or not self._is_plain(match, guess):
             self.events["looked_twice"] += 1
             match = self._best_of(view, rows, guess, match)
@@ -422,12 +397,13 @@ class Slam:
             return None
         self._lost_scans = 0
         self._learn(match, guess)
+        self._learn_heading(match, guess, free)
         return match
 
     def _is_plain(self, match: Match, guess: _Place) -> bool:
         """Whether a match needs no second look: it is held in every direction, and it lies where it was expected."""
         return (
-            match.share > 0.2
+            match.share > LEAST_SHARE
             and match.mean_cost < 0.45
             and weakest_information(match.information()) > HELD_PER_M2
             and max(guess.deviations(match.pose)) < self.settings.gate
@@ -435,12 +411,21 @@ class Slam:
 
     def _learn(self, match: Match, guess: _Place) -> None:
         """What a step that was matched well, by itself, says about odometry."""
-        if not guess.by_odometry or self._last is None or weakest_information(match.information()) < HELD_PER_M2:
+        step = guess.step
+        if step is None or weakest_information(match.information()) < HELD_PER_M2:
             return
-        step = self._last[1].inverse() @ guess.map_from_base
         if math.hypot(step.x_m, step.y_m) > 0.01 or abs(step.yaw_rad) > math.radians(0.5):
             off_m, off_rad = guess.deviations(match.pose)
             self._trust.learn(off_m / math.sqrt(2.0), off_rad)
+
+    def _learn_heading(self, match: Match, guess: _Place, free: Match | None) -> None:
+        """What a scan says about odometry's turns. free: its match that nothing held."""
+        if guess.step is None or free is None:
+            return
+        off_rad = wrap_angle(match.pose.yaw_rad - guess.map_from_sensor.yaw_rad) + guess.bias_rad
+        left_rad = wrap_angle(free.pose.yaw_rad - match.pose.yaw_rad)
+        is_rough = free.mean_cost >= ROUGH_COST or free.share <= LEAST_SHARE
+        self._heading.step(_along(guess.step), guess.step.yaw_rad, off_rad, left_rad, is_rough=is_rough)
 
     def _best_of(self, view: View, rows: I64, guess: _Place, match: Match | None) -> Match | None:
         """Of a free match, one that the prediction holds, and one searched for: what lies nearer to the prediction,
@@ -453,9 +438,33 @@ class Slam:
         if match is not None and (held is None or match.score > self._clearly(guess, match) * held.score):
             best = match
         fits = 0.0 if best is None else agreement(view, store, rows, poses, best.pose).explained
+        if best is not None and self._is_hollow(best, guess):
+            best, fits = self._turned_by_odometry(view, rows, guess, doubt, best, fits)
         if fits < 0.5:
             best, fits = self._looked_around(view, rows, guess, best, fits)
         return best if fits >= LEAST_FIT else None
+
+    def _is_hollow(self, match: Match, guess: _Place) -> bool:
+        """Whether a match may look good and be wrong: it lies on no planes, holds the pose badly, and odometry is known
+        to turn more truly than such matches do."""
+        is_held = match.mean_cost < ROUGH_COST or weakest_information(match.information()) > HELD_PER_M2
+        return guess.step is not None and not is_held and self._heading.is_better
+
+    def _turned_by_odometry(
+        self, view: View, rows: I64, guess: _Place, doubt: float, best: Match, fits: float
+    ) -> tuple[Match, float]:
+        """A match whose heading odometry holds, as far as it was true where scans could tell; the one there is if that
+        explains too little."""
+        assert guess.step is not None
+        sigma_rad = max(LEAST_RAD, self._heading.sigma_rad(_along(guess.step), guess.step.yaw_rad))
+        pull = replace(guess, sigma_rad=sigma_rad).information() / (1.0 - doubt) ** 4
+        store, poses = self._views.arrays(), self._poses[rows]
+        match = match_view(view, store, rows, poses, guess.map_from_sensor, prior=pull, reach=NEARBY)
+        found = 0.0 if match is None else agreement(view, store, rows, poses, match.pose).explained
+        if match is None or found < 0.5:
+            return best, fits
+        self.events["turned_by_odometry"] += 1
+        return match, found
 
     def _clearly(self, guess: _Place, match: Match) -> float:
         """How much better than what the prediction holds a match must fit to be believed: the more, the farther it
@@ -856,6 +865,11 @@ def run_here(slam: Slam, stamp_ns: int, result: WorkResult | None) -> WorkResult
         slam.apply(result)
         return None
     return result
+
+
+def _along(step: Pose2) -> float:
+    """The way of a step, negative backwards."""
+    return math.copysign(math.hypot(step.x_m, step.y_m), step.x_m)
 
 
 def _row(pose: Pose2) -> F64:

@@ -14,11 +14,13 @@ from mapping.localise.closure_records import Closure, ClosureSettings, Snapshot,
 from mapping.localise.closures import Work
 from mapping.localise.pose_graph import Edges
 from mapping.localise.scan_match import Agreement
-from mapping.localise.views import ViewStore
+from mapping.localise.views import View, ViewStore, table_for, view_of
+from mapping.scan import Scan
 
 STEP_M = 0.8
 AGAIN = 100  # key scans after which the way begins anew
 ROUGH = ClosureSettings().rough_worth
+FAINT = ClosureSettings().faint_worth
 
 
 def work(votes: int, worth: float, step_m: float = STEP_M) -> tuple[Work, list[Closure]]:
@@ -43,6 +45,9 @@ def work(votes: int, worth: float, step_m: float = STEP_M) -> tuple[Work, list[C
         (8, ROUGH, 0.8, False),
         (9, ROUGH, 0.8, True),
         (12, ROUGH, 0.5, False),  # 5.5 m of the way
+        (17, FAINT, 0.8, False),
+        (18, FAINT, 0.8, True),
+        (22, FAINT, 0.5, False),  # 10.5 m of the way
     ],
 )
 def test_so_many_votes_from_so_much_of_the_way_are_needed(
@@ -97,13 +102,49 @@ def test_who_asks_for_another_correction_is_no_vote() -> None:
         (Agreement(0.80, 0.02, 0.18, 100), 0.20, 100.0, 0.0),  # a bare corridor
         (Agreement(0.80, 0.02, 0.18, 100), 0.70, 1500.0, 0.0),
         (Agreement(0.80, 0.06, 0.14, 100), 0.50, 1500.0, 0.0),  # it sees through what was there
-        (Agreement(0.60, 0.00, 0.40, 100), 0.50, 1500.0, 0.0),
+        (Agreement(0.60, 0.00, 0.40, 100), 0.50, 1500.0, FAINT),
+        (Agreement(0.60, 0.00, 0.40, 100), 0.50, 100.0, 0.0),
+        (Agreement(0.60, 0.06, 0.34, 100), 0.50, 1500.0, 0.0),
+        (Agreement(0.60, 0.00, 0.40, 100), 0.25, 300.0, 0.0),  # plain: it repeats
+        (Agreement(0.45, 0.00, 0.55, 100), 0.50, 1500.0, 0.0),
     ],
 )
 def test_what_a_single_closure_is_worth(
     agrees: Agreement, mean_cost: float, weakest_per_m2: float, worth: float
 ) -> None:
     assert work(0, 1.0)[0]._worth(agrees, mean_cost, weakest_per_m2) == worth
+
+
+def test_faint_votes_beside_firm_ones_need_no_more_of_the_way() -> None:
+    judge, sure = work(3, 1.0)
+    assert len(judge._agreeing(sure + [replace(c, worth=FAINT) for c in work(6, 1.0)[1][3:]])[0]) == 6
+    few = sure[:2] + [replace(c, worth=FAINT) for c in work(8, 1.0)[1][2:]]
+    assert judge._agreeing(few)[0] == []  # two firm ones and six faint ones over 5.6 m
+
+
+def test_a_street_driven_the_other_way_is_laid_on_the_keys_that_saw_its_houses() -> None:
+    """Key scans look along the way and see what lies ahead: of a view the other way those farther on saw most."""
+    bearing = np.radians(np.arange(-90.0, 90.0))
+    table, store = table_for(bearing), ViewStore()
+
+    def seen_from(x_m: float, yaw_rad: float) -> View:
+        c, s = np.cos(bearing + yaw_rad), np.sin(bearing + yaw_rad)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = np.where(s > 0.0, 3.0 / s, -3.0 / s)
+            along = x_m + reach * c
+            end = np.where(c > 0.0, (40.0 - x_m) / c, (-10.0 - x_m) / c)  # the houses end, a wall stands across
+        reach = np.minimum(np.where((along > -10.0) & (along < 40.0), reach, np.inf), end)
+        return view_of(Scan(0, 0.0, bearing, np.where(reach < 9.0, reach, np.inf), 0.05, 30.0), table, farthest_m=30.0)
+
+    keys = np.arange(40)
+    for k in keys:
+        store.add(seen_from(0.5 * k, 0.0))
+    poses = np.stack((0.5 * keys, 0.0 * keys, 0.0 * keys), axis=-1)
+    shot = Snapshot(store.arrays(), np.vstack((poses, [[20.0, 0.0, math.pi]])), np.append(0.5 * keys, 100.0),
+                    Edges.none(), (), (), (), 0, 0)  # fmt: skip
+    judge, pose = Work(shot, ClosureSettings()), Pose2(14.0, 0.0, math.pi)
+    chosen = judge._seeing(seen_from(14.0, math.pi), 40, keys, pose)
+    assert 0.5 * chosen < 11.0  # looking that way from behind it: its own place saw nothing that it sees
 
 
 def test_rough_ones_stay_if_the_others_bear_them_out() -> None:
