@@ -346,7 +346,7 @@ def test_mrpt_records_scans_of_the_room(device: str, tmp_path: Path) -> None:
     loop.add("laser", make(), link)
     with loop:
         time.sleep(1.6)
-        seconds = 24 if device == "lms111" else 6  # it asks for the state of an LMS100 each 10 s
+        seconds = 24 if device == "lms111" else 12  # of an LMS100 it asks for the state each 10 s
         subprocess.run(
             ["bash", "-c", f"sleep {seconds} | rawlog-grabber {tmp_path / 'grab.ini'}"],
             cwd=tmp_path, capture_output=True, timeout=seconds + 20, check=False,
