@@ -264,6 +264,18 @@ def beam_ends(bearing: Any, distance: Any, range_min: float, least: float, x: fl
 
 
 @njit(cache=True)
+def nearer_than_both(obstacle: Any, first: Any, second: Any) -> Any:
+    """Indices of finite obstacles (N,) that are nearer than both others."""
+    found = np.empty(len(obstacle), dtype=np.int64)
+    count = 0
+    for k in range(len(obstacle)):
+        if math.isfinite(obstacle[k]) and obstacle[k] < first[k] and obstacle[k] < second[k]:
+            found[count] = k
+            count += 1
+    return found[:count]
+
+
+@njit(cache=True)
 def judge(
     obstacle: Any, u: Any, v: Any, free: Any, blind: Any, stamp: Any, fresh: Any, source: Any, all_heard: bool,
     now_ns: int, states: Any,

@@ -135,7 +135,7 @@ class Evidence:
         self._table = _Table(0, count)
         self._touched: dict[tuple[int, int], Finding] = {}  # of switches: what each would say if it were tripped
         self._heard = [not wait_for_sources] * len(sources)
-        self._nothing_held = (
+        self._nothing_held: tuple[F64, F64, F64, I64, Bool] = (
             np.full(count, np.inf),
             np.full(count, np.nan),
             np.full(count, np.nan),
@@ -162,13 +162,8 @@ class Evidence:
         old = self._channels.get((at, channel))
         if old is not None and not old.dead and stamp_ns < old.stamp_ns:
             return
-        if old is None or looked is None:
-            new = _Channel(at, stamp_ns, False, finding, *self._nothing_held, holds=False)
-        else:
-            m, u, v, stamps, dead = self._nothing_held
-            new = _Channel(
-                at, stamp_ns, False, finding, m.copy(), u.copy(), v.copy(), stamps.copy(), dead.copy(), holds=True
-            )
+        new = _Channel(at, stamp_ns, False, finding, *self._nothing_held, holds=False)
+        if old is not None and looked is not None:
             _hold(new, old, looked)
         self._channels[at, channel] = new
         if old is None:
@@ -229,17 +224,30 @@ class Evidence:
 
 
 def _hold(new: _Channel, old: _Channel, looked: Looked) -> None:
-    # Of the last finding and what was held before it: the nearest obstacle nobody has looked at since.
-    stamps, dead = np.full(len(old.held_m), old.stamp_ns), np.full(len(old.held_m), old.dead)
-    generations = (
-        (old.held_m, old.held_u, old.held_v, old.held_stamp_ns, old.held_dead),
-        (old.finding.obstacle_m, old.finding.u, old.finding.v, stamps, dead),
-    )
-    for obstacle_m, u, v, stamp_ns, is_dead in generations:
-        nearer = np.isfinite(obstacle_m) & (obstacle_m < new.finding.obstacle_m) & (obstacle_m < new.held_m)
-        stays = np.flatnonzero(nearer)
-        if len(stays) == 0:
-            continue
-        stays = stays[~looked(obstacle_m[stays], u[stays], v[stays])]
-        new.held_m[stays], new.held_u[stays], new.held_v[stays] = obstacle_m[stays], u[stays], v[stays]
-        new.held_stamp_ns[stays], new.held_dead[stays] = stamp_ns[stays], is_dead[stays]
+    """Of what was held before and of the last finding: the nearest obstacle nobody has looked at since."""
+    if old.holds:
+        stays = _unseen(new, old.held_m, old.held_u, old.held_v, looked)
+        if len(stays):
+            _hold_also(new, stays, old.held_m, old.held_u, old.held_v)
+            new.held_stamp_ns[stays], new.held_dead[stays] = old.held_stamp_ns[stays], old.held_dead[stays]
+    found = old.finding
+    stays = _unseen(new, found.obstacle_m, found.u, found.v, looked)
+    if len(stays):
+        _hold_also(new, stays, found.obstacle_m, found.u, found.v)
+        new.held_stamp_ns[stays], new.held_dead[stays] = old.stamp_ns, old.dead
+
+
+def _unseen(new: _Channel, obstacle_m: F64, u: F64, v: F64, looked: Looked) -> I64:
+    """Sectors whose obstacle is nearer than all the new reading and what is held already say, and not looked at."""
+    ours_m = new.finding.obstacle_m
+    nearer: I64 = kernels.nearer_than_both(obstacle_m, ours_m, new.held_m if new.holds else ours_m)
+    if len(nearer) == 0:
+        return nearer
+    return nearer[~looked(obstacle_m[nearer], u[nearer], v[nearer])]
+
+
+def _hold_also(new: _Channel, stays: I64, obstacle_m: F64, u: F64, v: F64) -> None:
+    if not new.holds:  # until now it has what stands for nothing held
+        new.held_m, new.held_u, new.held_v = new.held_m.copy(), new.held_u.copy(), new.held_v.copy()
+        new.held_stamp_ns, new.held_dead, new.holds = new.held_stamp_ns.copy(), new.held_dead.copy(), True
+    new.held_m[stays], new.held_u[stays], new.held_v[stays] = obstacle_m[stays], u[stays], v[stays]
