@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,13 +41,13 @@ def seen_from(at: Pose2, scan: Scan, poses: F64) -> tuple[F64, F64]:
     poses: (N, 3) of the sensor at each beam, in the frame of `at`. Beams may have changed places there. Those without a
     range keep their status, and turn as the sensor did.
     """
-    hit = np.isfinite(scan.range_m)
-    bearing = scan.bearing_rad + (poses[:, 2] - at.yaw_rad)
-    distance = scan.range_m.copy()
-    angle = scan.bearing_rad[hit] + poses[hit, 2]
-    reach = scan.range_m[hit][:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-    points = at.inverse().apply(poses[hit, :2] + reach)
-    seen = np.arctan2(points[:, 1], points[:, 0])
-    bearing[hit] += (seen - bearing[hit] + math.pi) % (2.0 * math.pi) - math.pi
-    distance[hit] = np.hypot(points[:, 0], points[:, 1])
+    from mapping.kernels import motion as kernels  # here, for programs that only hand scans on
+
+    if poses.shape != (len(scan.bearing_rad), 3):
+        raise ValueError(f"{len(scan.bearing_rad)} beams need as many poses, got {poses.shape}")
+    bearing, distance = np.empty(len(poses)), np.empty(len(poses))
+    kernels.seen_from(
+        np.ascontiguousarray(poses), at.x_m, at.y_m, at.yaw_rad, np.ascontiguousarray(scan.bearing_rad),
+        np.ascontiguousarray(scan.range_m), bearing, distance,
+    )  # fmt: skip
     return bearing, distance

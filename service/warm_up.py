@@ -84,7 +84,7 @@ def _steps(config: Config) -> dict[str, Step]:
     """What there is to warm up, by name; the small ones first: the first tells whether the cache is cold."""
     found = assemble.sensors(config)
     names = {maker.name for maker in assemble_makers.map_makers(config, found)}
-    steps: dict[str, Step] = {"footprint": lambda: _footprint(config), "clearance": _clearance}
+    steps: dict[str, Step] = {"footprint": lambda: _footprint(config), "clearance": _clearance, "scan": _scan}
     if "lines" in names:
         from mapping.lines.warm_up import warm_up as warm_up_lines
 
@@ -239,6 +239,13 @@ def _footprint(config: Config) -> None:
     from mapping.sectors.footprint import in_polygon
 
     in_polygon(np.zeros((1, 2)), np.array(config.robot.footprint_m))
+
+
+def _scan() -> None:
+    from mapping.frames import IDENTITY
+    from mapping.scan import Scan, seen_from
+
+    seen_from(IDENTITY, Scan(0, 0.0, np.zeros(1), np.ones(1), 0.1, 10.0), np.zeros((1, 3)))
 
 
 def _fusion(config: Config, found: dict[str, Sensor]) -> None:

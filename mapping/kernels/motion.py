@@ -145,6 +145,34 @@ def seen_at_once(
 
 
 @njit(cache=True)
+def seen_from(
+    sensor: Any,
+    at_x: float,
+    at_y: float,
+    at_yaw: float,
+    bearing: Any,
+    distance: Any,
+    new_bearing: Any,
+    new_distance: Any,
+) -> None:
+    """Beams, each measured from its own pose sensor (N, 3), as from one pose of that frame, into new_* (N,).
+
+    Bearings stay near those that were measured, whole turns included. A beam without a length is turned, not moved.
+    """
+    cos, sin = math.cos(at_yaw), math.sin(at_yaw)
+    for k in range(len(bearing)):
+        turned = bearing[k] + (sensor[k, 2] - at_yaw)
+        new_bearing[k], new_distance[k] = turned, distance[k]
+        if math.isfinite(distance[k]):
+            angle = bearing[k] + sensor[k, 2]
+            dx = sensor[k, 0] + distance[k] * math.cos(angle) - at_x
+            dy = sensor[k, 1] + distance[k] * math.sin(angle) - at_y
+            x, y = cos * dx + sin * dy, cos * dy - sin * dx
+            new_bearing[k] = turned + wrapped(math.atan2(y, x) - turned)
+            new_distance[k] = math.hypot(x, y)
+
+
+@njit(cache=True)
 def rolled_covariance(
     covariance: Any, yaw: float, way: float, turn: float, track: float, left_var: float, right_var: float
 ) -> Any:
