@@ -245,14 +245,17 @@ def _scan() -> None:
     from mapping.frames import IDENTITY
     from mapping.scan import Scan, seen_from
 
-    seen_from(IDENTITY, Scan(0, 0.0, np.zeros(1), np.ones(1), 0.1, 10.0), np.zeros((1, 3)))
+    for is_writeable in (False, True):  # bearings that drivers keep, and those of others
+        bearing = np.zeros(1)
+        bearing.setflags(write=is_writeable)
+        seen_from(IDENTITY, Scan(0, 0.0, bearing, np.ones(1), 0.1, 10.0), np.zeros((1, 3)))
 
 
 def _fusion(config: Config, found: dict[str, Sensor]) -> None:
     fusion = Fusion(assemble.parts(config, found, assemble.maps(config, found), OdometryOnly()))
     encoder = Encoder()
     now_ns = 0
-    for step in range(4):  # standing, then moving: the two take different kernels
+    for step in range(8):  # standing, then moving: the two take different kernels
         now_ns += 100_000_000
         for name, sensor in found.items():
             fusion.on_item(name, _pretended(sensor, step, now_ns), now_ns)
@@ -268,6 +271,7 @@ def _pretended(sensor: Sensor, step: int, now_ns: int) -> Reading:
     match sensor:
         case Laser():
             bearing = np.linspace(-2.0, 2.0, 64)
+            bearing.setflags(write=step >= 4)  # what is compiled for the one does not serve the other
             distance = np.full(64, 2.0)
             distance[:3] = (np.inf, -np.inf, np.nan)
             return ScanReading(now_ns, 100_000.0 * (step % 2), 100_000_000, bearing, distance, 0.05, 10.0)
