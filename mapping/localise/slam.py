@@ -165,14 +165,13 @@ class _Sensor:
 @dataclass(frozen=True, slots=True)
 class _Place:
     """A predicted pose in the map and its standard deviations; step: what odometry says the base moved, if it is from
-    there, before bias_rad, which it is known to turn too little, was put on."""
+    there."""
 
     map_from_sensor: Pose2
     map_from_base: Pose2
     sigma_m: float
     sigma_rad: float
     step: Pose2 | None = None
-    bias_rad: float = 0.0
 
     def information(self) -> F64:
         """(3, 3) of x, y, yaw."""
@@ -357,9 +356,7 @@ class Slam:
         if odom_from_base is not None and last_odom is not None:
             step = last_odom.inverse() @ odom_from_base
             sigma_m, sigma_rad = self._odometry_sigma(math.hypot(step.x_m, step.y_m), abs(step.yaw_rad))
-            bias_rad = self._heading.bias_rad(_along(step), step.yaw_rad)
-            moved = last_pose @ Pose2(step.x_m, step.y_m, step.yaw_rad + bias_rad)
-            return _Place(moved @ base_from_sensor, moved, sigma_m, sigma_rad, step, bias_rad)
+            return _Place(last_pose @ step @ base_from_sensor, last_pose @ step, sigma_m, sigma_rad, step)
         seconds = min(max((stamp_ns - last_ns) * 1e-9, 0.0), 0.5)
         way = self._velocity * seconds
         sigma_m = 0.05 + 2.0 * seconds**2 + 0.3 * math.hypot(way[0], way[1])
@@ -422,7 +419,7 @@ class Slam:
         """What a scan says about odometry's turns. free: its match that nothing held."""
         if guess.step is None or free is None:
             return
-        off_rad = wrap_angle(match.pose.yaw_rad - guess.map_from_sensor.yaw_rad) + guess.bias_rad
+        off_rad = wrap_angle(match.pose.yaw_rad - guess.map_from_sensor.yaw_rad)
         left_rad = wrap_angle(free.pose.yaw_rad - match.pose.yaw_rad)
         is_rough = free.mean_cost >= ROUGH_COST or free.share <= LEAST_SHARE
         self._heading.step(_along(guess.step), guess.step.yaw_rad, off_rad, left_rad, is_rough=is_rough)
@@ -456,10 +453,12 @@ class Slam:
         """A match whose heading odometry holds, as far as it was true where scans could tell; the one there is if that
         explains too little."""
         assert guess.step is not None
-        sigma_rad = max(LEAST_RAD, self._heading.sigma_rad(_along(guess.step), guess.step.yaw_rad))
+        along_m, turn_rad = _along(guess.step), guess.step.yaw_rad
+        expected = guess.map_from_sensor @ Pose2(0.0, 0.0, self._heading.bias_rad(along_m, turn_rad))
+        sigma_rad = max(LEAST_RAD, self._heading.sigma_rad(along_m, turn_rad))
         pull = replace(guess, sigma_rad=sigma_rad).information() / (1.0 - doubt) ** 4
         store, poses = self._views.arrays(), self._poses[rows]
-        match = match_view(view, store, rows, poses, guess.map_from_sensor, prior=pull, reach=NEARBY)
+        match = match_view(view, store, rows, poses, expected, prior=pull, reach=NEARBY)
         found = 0.0 if match is None else agreement(view, store, rows, poses, match.pose).explained
         if match is None or found < 0.5:
             return best, fits
