@@ -1,8 +1,9 @@
 """Voronoi diagram, planner and grid A* on plans of 2,000 x 2,000 cells, in one run.
 
-    python bench/planning.py [--pairs N] [--plan NAME] [--json FILE]
+    python bench/planning.py [--pairs N] [--plan NAME] [--maps FOLDER] [--json FILE]
 
-The plans are in plans.py. Times are of the processor. Figures; those of the diagram are of the first plan:
+The plans are in plans.py; with --maps the PNG maps in a folder are taken instead (white is free, pixels of 5 cm). Times
+are of the processor. Figures; those of the diagram are of the first plan:
 scratch     distances, base points and diagram of the whole grid; scikit-image's medial axis beside it, if installed
 update      after one scan has changed some hundreds of cells up to 10 m around a place
 graph       thinning the diagram and following its lines: makes a planner warm
@@ -29,6 +30,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -201,23 +203,33 @@ def planning_figures(free: Bools, pairs: int) -> dict[str, float]:
     }  # fmt: skip
 
 
+def maps_in(folder: Path) -> dict[str, Callable[[], Bools]]:
+    """By name, those of a folder but for pictures of rooms."""
+
+    def reader(path: Path) -> Callable[[], Bools]:
+        return lambda: np.asarray(np.asarray(Image.open(path).convert("L")) >= 250)
+
+    return {p.stem: reader(p) for p in sorted(folder.glob("*.png")) if not p.stem.endswith(".rooms")}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=200)
-    parser.add_argument("--plan", choices=PLANS, help="this one only")
+    parser.add_argument("--plan", help="this one only")
+    parser.add_argument("--maps", type=Path, help="a folder of PNG maps instead")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    names = [arguments.plan] if arguments.plan else list(PLANS)
     warm = Planner(VoronoiGrid(hall_of_boxes(side=400, boxes=100)), CELL_M)  # compiles
     warm.plan((2.0, 2.0), (18.0, 18.0), alternatives=0)
     wall = np.pad(np.ones((98, 98), dtype=np.bool_), 1)
     wall[49, 1:90] = False
     Planner(VoronoiGrid(wall), CELL_M).plan((0.5, 2.0), (0.5, 3.0), alternatives=2)  # also what near ends need
     figures: dict[str, dict[str, float]] = {}
-    for name in names:
-        free = PLANS[name]()
+    plans = PLANS if arguments.maps is None else maps_in(arguments.maps)
+    for name in [arguments.plan] if arguments.plan else list(plans):
+        free = plans[name]()
         figures[name] = {
-            **(diagram_figures(free) if name == names[0] else {}),
+            **(diagram_figures(free) if name == next(iter(PLANS)) else {}),
             **planning_figures(free, arguments.pairs),
         }
         print(name)

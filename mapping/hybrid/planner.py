@@ -18,7 +18,9 @@ from mapping.grids.geometry import check_resolution
 from mapping.hybrid.corners import CornerGraph, landmarks
 from mapping.hybrid.voronoi import VoronoiGrid
 from mapping.kernels import paths as kernels
+from mapping.kernels.corner_ways import plan_round
 from mapping.kernels.rooms import connected
+from mapping.kernels.sight import length_of, measure_room, taut
 
 Bools = NDArray[np.bool_]
 F64 = NDArray[np.float64]
@@ -30,7 +32,7 @@ HALF_CELLS = math.sqrt(2.0)
 
 _USED_AGAIN = 1.4  # what an edge of an earlier way costs in the search for others
 _ELSEWHERE = 0.3  # of an alternative's length, at least
-_PULLS = 2
+_PULLS = 1
 _APART_M = 0.5  # poses of a way, at most
 _CLEARANCES_KEPT = 3
 _NEAR_CELLS = 120  # ends nearer than this are joined on the grid, too, if the way is so much longer than straight on:
@@ -137,6 +139,8 @@ class Planner:
         self._heap, self._key = np.empty(room, dtype=np.int32), np.empty(room)
         self._cells = np.empty(len(graph.chain) + len(graph.node), dtype=np.int32)
         self._used = np.empty(len(graph.edge), dtype=np.int32)
+        self._given: tuple[Any, ...] | None = None  # what plan_round takes but for the ends, for this clearance:
+        self._given_for_m = math.nan
         self._room_for_poses(1 << 10)
 
     def plan(
@@ -147,17 +151,18 @@ class Planner:
         alternatives: how many others at most. Raises NoWayError if there is none, ValueError for numbers that are no
         positions or no clearance.
         """
+        if alternatives == 0 and (way := self._at_once(start, goal, clearance_m)) is not None:
+            return Plan(way, ())
         if not (math.isfinite(clearance_m) and clearance_m >= 0.0):
             raise ValueError(f"clearance_m is a length, got {clearance_m}")
         need = clearance_m / self.resolution_m + HALF_CELLS
-        first, last = self._cell("start", start, need), self._cell("goal", goal, need)
-        if alternatives == 0 and (way := self._round_corners(first, last, need)) is not None:
-            return Plan(way, ())
-        begin, end = np.array(first), np.array(last)
+        begin, end = np.array(self._cell("start", start, need)), np.array(self._cell("goal", goal, need))
+        if self._given is None or clearance_m != self._given_for_m:
+            self.ready_for(clearance_m)
         pulled = self._ways(begin, end, need, alternatives)
         if not pulled:
             raise NoWayError(f"no way with {clearance_m:.2f} m of clearance leads from the start to the goal")
-        pulled.sort(key=lambda corners: float(kernels.length_of(corners, len(corners))))
+        pulled.sort(key=lambda corners: float(length_of(corners, len(corners))))
         kept = pulled[:1]
         for corners in pulled[1:]:
             if len(kept) <= alternatives and all(_goes_elsewhere(corners, other) for other in kept):
@@ -165,14 +170,17 @@ class Planner:
         described = [self._describe(corners) for corners in kept]
         return Plan(described[0], tuple(described[1:]))
 
-    def _round_corners(self, begin: tuple[float, float], end: tuple[float, float], need: float) -> Way | None:
-        """The way from corner to corner, if it is known and nothing else is to be tried; all in one compiled call."""
-        tables = self._tables_for(need)
-        corners, poses, length_m, least_m = tables.corners.plan((tables.part, *self._to_describe), begin, end)
-        straight = math.dist(begin, end)
-        if corners == 0 or (straight <= _NEAR_CELLS and length_m > _DETOUR * straight * self.resolution_m):
+    def _at_once(self, start: tuple[float, float], goal: tuple[float, float], clearance_m: float) -> Way | None:
+        """The way from corner to corner, if it is known and nothing else is to be tried, in one compiled call; of the
+        clearance that was asked for last."""
+        if self._given is None or clearance_m != self._given_for_m:
+            return None
+        given = (*self._given, float(start[0]), float(start[1]), float(goal[0]), float(goal[1]))
+        corners, poses, length_m, least_m = plan_round(*given)
+        if corners == 0:
             return None
         if poses > len(self._clear):
+            tables = self._tables_for(clearance_m / self.resolution_m + HALF_CELLS)
             return self._describe(tables.corners.last_way(corners))
         return Way(self._pose[:poses].copy(), length_m, self._clear[:poses].copy(), least_m)
 
@@ -183,7 +191,7 @@ class Planner:
         found = self._tables_for(need).corners.way(begin, end)
         ways = [] if found is None else [found]
         straight = math.hypot(*(end - begin))
-        if straight <= _NEAR_CELLS and (found is None or kernels.length_of(found, len(found)) > _DETOUR * straight):
+        if straight <= _NEAR_CELLS and (found is None or length_of(found, len(found)) > _DETOUR * straight):
             cells = self._on_grid(begin, end, need, margin=_NEAR_CELLS // 3)
             if len(cells):
                 ways.append(self._taut(cells, begin, end, need))
@@ -202,7 +210,19 @@ class Planner:
 
     def ready_for(self, clearance_m: float) -> None:
         """Make now what the first plan with this clearance would have to wait for."""
-        self._tables_for(clearance_m / self.resolution_m + HALF_CELLS)
+        need = clearance_m / self.resolution_m + HALF_CELLS
+        tables = self._tables_for(need)
+        squared, *others = self._to_describe
+        self._given_for_m = clearance_m
+        self._given = (
+            tables.part,
+            squared,
+            math.ceil(need * need),
+            float(_NEAR_CELLS),
+            _DETOUR,
+            *others,
+            *tables.corners.given,
+        )
 
     def _cell(self, what: str, place: tuple[float, float], need: float) -> tuple[float, float]:
         """(row, col) in cells, a cell's centre at whole numbers; NoWayError if it is not free enough."""
@@ -281,11 +301,11 @@ class Planner:
             graph, room = self.graph, np.empty(self.grid.shape, dtype=np.uint8)
             usable = np.empty(len(graph.edge), dtype=np.bool_)
             kernels.open_edges(graph.edge, graph.least_squared, math.ceil(need * need), graph.leads_out, usable)
-            kernels.measure_room(self.grid.field.squared, need, room)
+            measure_room(self.grid.field.squared, need, room)
             part = np.empty(self.grid.shape, dtype=np.int32)
             connected(room > 0, True, part)
             corners = CornerGraph(self.grid, need, room, graph.edge, graph.chain, graph.first)
-            tables = _Tables(usable, room, corners, part)
+            tables = _Tables(usable, corners, part)
         self._tables[need] = tables
         if len(self._tables) > _CLEARANCES_KEPT:
             del self._tables[next(iter(self._tables))]
@@ -359,11 +379,12 @@ class Planner:
         points[0], points[n - 1] = begin, end
         points[1 : n - 1, 0], points[1 : n - 1, 1] = rows, cols
         work = np.empty_like(points)
-        n = int(kernels.taut(self._tables_for(need).room, points, n, _PULLS, work))
+        n = int(taut(*self._tables_for(need).corners.sight, points, n, _PULLS, work))
         return points[:n].copy()
 
     def _room_for_poses(self, count: int) -> None:
         self._pose, self._clear = np.empty((count, 3)), np.empty(count)
+        self._given = None
         self._to_describe: tuple[Any, ...] = (
             self.grid.field.squared, _APART_M / self.resolution_m, self.resolution_m, float(self.row0),
             float(self.col0), HALF_CELLS, self._pose, self._clear,
@@ -381,11 +402,10 @@ class Planner:
 
 @dataclass(frozen=True, slots=True)
 class _Tables:
-    """For one clearance. usable: (E,) edges wide enough, without dead ends.  room: (R, C) from kernels.measure_room.
-    corners: of the same clearance.  part: (R, C), cells of one number hang together, -1 where there is too little."""
+    """For one clearance. usable: (E,) edges wide enough, without dead ends.  corners: of the same clearance.
+    part: (R, C), cells of one number hang together, -1 where there is too little."""
 
     usable: Bools
-    room: NDArray[np.uint8]
     corners: CornerGraph
     part: I32
 

@@ -1,14 +1,12 @@
-"""Compiled loops of planning round corners (S44): which places ways go round, which see each other, shortest ways.
+"""Compiled loops of planning round corners (S44): which places ways go round, which see each other.
 
     squared (R, C) int32    squared distance to the nearest obstacle in cells, 0 on obstacles
     site    (R, C) int32    that obstacle, row << 16 | column
-    room    (R, C) uint8    from paths.measure_room: 0 where a way may not go
+    room    (R, C) uint8    of mapping.kernels.sight, as by_row and by_col
     total   (R+1, C+1) int32  how many cells above and left of a corner of cells may be gone
     place   (N, 2) int32    cells that ways go round or through, sorted by tiles of TILE cells
     outward (N, 2) float64  away from what a way goes round there, 0 in the middle of a narrow passage
     first   (tiles + 1,) int32  the places of tile t are first[t] to first[t + 1]
-    spot    (N, SPOT) float32  what a search asks of a place, side by side in memory: its cell, outward, and the
-                              shortest way from each landmark (0 where there are fewer landmarks)
 
 Run the tests also with NUMBA_BOUNDSCHECK=1 (and a NUMBA_CACHE_DIR of its own) and with NUMBA_DISABLE_JIT=1.
 """
@@ -21,18 +19,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from mapping.kernels.paths import _FAR_AWAY, describe, pop, push, sees_by_room, taut
 from mapping.kernels.rooms import critical_line
+from mapping.kernels.sight import sees_open
 
 TILE = 50
 SECTORS = 64
-MARKS = 8
-ROW, COL, OUT_ROW, OUT_COL, MARK = range(5)  # columns of spot
-SPOT = 16  # of these, so that each place has a line of the cache
-STATE, VIA, BEST, TO_END = range(4)  # columns of search (the first two) and reach
-OTHER, COST = range(2)  # columns of link and cost
-_ROUND = 0.9  # a way that comes from straight in front of a corner (cosine above this) need not go round it
-_EAGER = 1.02  # what is still to go counts so much more: fewer places are looked at for a way of about the same length
+ROUND = 0.9  # a way that comes from straight in front of a corner (cosine above this) need not go round it
 _FAILS = 12  # so many places of a sector out of sight, and the others are not looked at
 _SLACK, _SLACK_CELLS = 1.1, 10.0  # how much farther than a ray of the sector one looks for places
 
@@ -217,7 +209,7 @@ def look_around(
     for k in range(SECTORS):
         ur, uc = direction_of(k)
         reach[k] = 0.0
-        if ur * outward_r + uc * outward_c <= _ROUND + 0.1:
+        if ur * outward_r + uc * outward_c <= ROUND + 0.1:
             reach[k] = _SLACK * ray(room, r, c, ur, uc, step) + _SLACK_CELLS
         box[0], box[1] = min(box[0], r + reach[k] * ur), max(box[1], r + reach[k] * ur)
         box[2], box[3] = min(box[2], c + reach[k] * uc), max(box[3], c + reach[k] * uc)
@@ -226,7 +218,10 @@ def look_around(
 
 
 @njit(cache=True, nogil=True)
-def link_places(room: Any, place: Any, outward: Any, first: Any, across: int, step: float, pair: Any) -> Any:
+def link_places(
+    room: Any, by_row: Any, by_col: Any, place: Any, outward: Any, first: Any, across: int, step: float,
+    pair: Any,
+) -> Any:  # fmt: skip
     """Pairs of places that see each other and that a way might join, the nearest of each sector: how many.
 
     across: tiles side by side.  step: of rays.  pair: (M, 2) int32 out; what does not fit is counted only.
@@ -251,9 +246,9 @@ def link_places(room: Any, place: Any, outward: Any, first: Any, across: int, st
                     for j in range(max(first[a * across + b], i + 1), first[a * across + b + 1]):
                         dr, dc = place[j, 0] - r, place[j, 1] - c
                         length = math.sqrt(dr * dr + dc * dc)
-                        if length == 0.0 or dr * ni + dc * mi > _ROUND * length:
+                        if length == 0.0 or dr * ni + dc * mi > ROUND * length:
                             continue
-                        if -dr * outward[j, 0] - dc * outward[j, 1] > _ROUND * length:
+                        if -dr * outward[j, 0] - dc * outward[j, 1] > ROUND * length:
                             continue
                         k = sector_of(dr, dc)
                         back = (k + SECTORS // 2) % SECTORS
@@ -261,7 +256,7 @@ def link_places(room: Any, place: Any, outward: Any, first: Any, across: int, st
                             continue
                         if linked[i, k // 2] and linked[j, back // 2]:
                             continue
-                        if not sees_by_room(room, r, c, float(place[j, 0]), float(place[j, 1])):
+                        if not sees_open(by_row, by_col, r, c, float(place[j, 0]), float(place[j, 1])):
                             fails[k] += 1
                             continue
                         if m < pair.shape[0]:
@@ -269,174 +264,3 @@ def link_places(room: Any, place: Any, outward: Any, first: Any, across: int, st
                         m += 1
                         linked[i, k // 2] = linked[j, back // 2] = True
     return m
-
-
-@njit(cache=True, nogil=True)
-def places_around(
-    room: Any, spot: Any, tile: Any, across: int, step: float, r: float, c: float, which: Any, far: Any
-) -> Any:
-    """Places that may be seen from a point and that a way from there may go round: how many. Sight is not looked at.
-
-    which: (N,) int32, far: (N,) float64, out: their numbers and distances.
-    """
-    n, down = 0, (tile.size - 1) // across
-    span, box = np.empty(SECTORS), np.empty(4)
-    look_around(room, r, c, 0.0, 0.0, step, span, box)
-    left, right = max(int(box[2]) // TILE, 0), min(int(box[3]) // TILE, across - 1)
-    for a in range(max(int(box[0]) // TILE, 0), min(int(box[1]) // TILE, down - 1) + 1):
-        for b in range(left, right + 1):
-            if tile[a * across + b] == tile[a * across + b + 1] or beyond(span, r, c, a, b):
-                continue
-            for j in range(tile[a * across + b], tile[a * across + b + 1]):
-                dr, dc = spot[j, ROW] - r, spot[j, COL] - c
-                length = math.sqrt(dr * dr + dc * dc)
-                if -dr * spot[j, OUT_ROW] - dc * spot[j, OUT_COL] > _ROUND * length:
-                    continue
-                if length <= span[sector_of(dr, dc)]:
-                    which[n], far[n] = j, length
-                    n += 1
-    return n
-
-
-@njit(cache=True, nogil=True)
-def from_marks(room: Any, spot: Any, r: float, c: float, n: int, which: Any, far: Any, from_mark: Any) -> None:
-    """from_mark: (MARKS,) float32 out, shortest way from each landmark to a point by what it sees of n places around.
-
-    far: of those found to be out of sight it becomes huge. Only the nearest by way of a landmark are looked for.
-    """
-    looked = np.zeros(n, dtype=np.bool_)
-    for k in range(MARKS):
-        while True:
-            nearest, least = -1, np.float64(0.5 * _FAR_AWAY)
-            for i in range(n):
-                there = spot[which[i], MARK + k] + far[i]
-                if there < least:
-                    nearest, least = i, there
-            if nearest < 0:
-                from_mark[k] = _FAR_AWAY
-                break
-            j = which[nearest]
-            if not looked[nearest] and not sees_by_room(room, r, c, spot[j, ROW], spot[j, COL]):
-                far[nearest] = _FAR_AWAY
-                continue
-            looked[nearest] = True
-            from_mark[k] = least
-            break
-
-
-@njit(cache=True, nogil=True)
-def eager_bound(spot: Any, n: int, r: float, c: float, from_mark: Any) -> float:
-    """What is still to go from place n to a point, at least, as paths.still_to_go; _EAGER times that."""
-    bound = np.float32(0.0)
-    for k in range(MARKS):
-        apart = abs(from_mark[k] - spot[n, MARK + k])
-        if apart > bound:
-            bound = apart
-    dr, dc = spot[n, ROW] - r, spot[n, COL] - c
-    straight = math.sqrt(dr * dr + dc * dc)
-    by_marks = np.float64(0.9999 * bound)  # what 32 bits may have rounded up
-    return _EAGER * (straight if bound > 0.5 * _FAR_AWAY or by_marks < straight else by_marks)
-
-
-@njit(cache=True, nogil=True)
-def way_round(
-    room: Any, spot: Any, first: Any, link: Any, search: Any, tile: Any, across: int, step: float, cost: Any,
-    reach: Any, heap: Any, key: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
-    stamp: int, r0: float, c0: float, r1: float, c1: float,
-) -> Any:  # fmt: skip
-    """The shortest way from place to place between two points, pulled taut; how many points it has, 0 if there is none.
-
-    tile: the places of each tile.  first, link: of place n link[first[n] : first[n + 1]], column OTHER the place it is
-    joined with; cost: the same memory as float32, column COST how far that is.  search: (N, 4) int32, columns STATE
-    and VIA, states of this search are stamp and stamp + 1, all others are less; reach: the same memory as float32,
-    columns BEST and TO_END, the latter huge before and after.  heap, key, which (2, N), far (2, N), work: work.
-    r0, c0, r1, c1: begin and end, open.  point: (N + 2, 2) out.
-
-    Whether the ends see a place is looked at only where a shortest way would begin or end with it.
-    """
-    point[0, 0], point[0, 1], point[1, 0], point[1, 1] = r0, c0, r1, c1
-    if sees_by_room(room, r0, c0, r1, c1):
-        return 2
-    met, done = stamp, stamp + 1
-    size = np.zeros(1, dtype=np.int64)
-    from_mark = np.empty(MARKS, dtype=np.float32)
-    seeds = places_around(room, spot, tile, across, step, r0, c0, which[0], far[0])
-    ends = places_around(room, spot, tile, across, step, r1, c1, which[1], far[1])
-    from_marks(room, spot, r1, c1, ends, which[1], far[1], from_mark)
-    for i in range(ends):
-        reach[which[1, i], TO_END] = far[1, i]
-    for i in range(seeds):
-        push(heap, key, size, far[0, i] + eager_bound(spot, which[0, i], r1, c1, from_mark), -1 - i)
-    last, total = -1, _FAR_AWAY
-    better, promise = np.empty(64, dtype=np.int32), np.empty(64)
-    while size[0] > 0 and key[0] < total:
-        n = pop(heap, key, size)
-        if n < 0:  # straight from the beginning
-            i = -1 - n
-            n = which[0, i]
-            if search[n, STATE] == done or not sees_by_room(room, r0, c0, spot[n, ROW], spot[n, COL]):
-                continue
-            reach[n, BEST], search[n, VIA] = far[0, i], -1
-        elif search[n, STATE] == done:
-            continue
-        search[n, STATE] = done
-        here = np.float64(reach[n, BEST])
-        if here + reach[n, TO_END] < total and sees_by_room(room, spot[n, ROW], spot[n, COL], r1, c1):
-            last, total = n, here + reach[n, TO_END]
-        # First which, then how far, then all else: loads that wait for nothing but memory go side by side.
-        begin, k = first[n], 0
-        if first[n + 1] - begin > better.size:
-            better = np.empty(first[n + 1] - begin, dtype=np.int32)
-            promise = np.empty(better.size)
-        for i in range(begin, first[n + 1]):
-            m = link[i, OTHER]
-            better[k] = i
-            k += (search[m, STATE] < met) | ((search[m, STATE] == met) & (here + cost[i, COST] < reach[m, BEST]))
-        for j in range(k):
-            i = better[j]
-            promise[j] = here + cost[i, COST] + eager_bound(spot, link[i, OTHER], r1, c1, from_mark)
-        for j in range(k):
-            i = better[j]
-            m = link[i, OTHER]
-            reach[m, BEST], search[m, STATE], search[m, VIA] = here + cost[i, COST], met, n
-            if promise[j] < total:
-                push(heap, key, size, promise[j], m)
-    for i in range(ends):
-        reach[which[1, i], TO_END] = _FAR_AWAY
-    if last < 0:
-        return 0
-    n = 2
-    k = last
-    while search[k, VIA] >= 0:
-        n += 1
-        k = search[k, VIA]
-    point[n, 0], point[n, 1] = r1, c1
-    k = last
-    for i in range(n - 1, 0, -1):
-        point[i, 0], point[i, 1] = spot[k, ROW], spot[k, COL]
-        k = search[k, VIA]
-    return taut(room, point, n + 1, rounds, work)
-
-
-@njit(cache=True, nogil=True)
-def plan_round(
-    part: Any, squared: Any, spacing: float, cell_m: float, row0: float, col0: float, less: float, pose: Any,
-    clear: Any, room: Any, spot: Any, first: Any, link: Any, search: Any, tile: Any, across: int, step: float,
-    cost: Any, reach: Any, heap: Any, key: Any, which: Any, far: Any, point: Any, work: Any, rounds: int,
-    stamp: int, r0: float, c0: float, r1: float, c1: float,
-) -> Any:  # fmt: skip
-    """A whole plan in one call: what way_round finds between open places, and of it what paths.describe tells.
-
-    part: (R, C) int32, cells of one number hang together.  Number of corners (0 if no way is known), number of poses,
-    length and least clearance in metres.
-    """
-    n = 0
-    if part[int(r0 + 0.5), int(c0 + 0.5)] == part[int(r1 + 0.5), int(c1 + 0.5)]:
-        n = way_round(
-            room, spot, first, link, search, tile, across, step, cost, reach, heap, key, which, far, point, work,
-            rounds, stamp, r0, c0, r1, c1,
-        )  # fmt: skip
-    if n == 0:
-        return 0, 0, 0.0, 0.0
-    m, length, least = describe(squared, point, n, spacing, cell_m, row0, col0, less, pose, clear)
-    return n, m, length, least

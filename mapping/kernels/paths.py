@@ -22,7 +22,6 @@ A, B, BEGIN, END = range(4)
 _ROW_STEP = (-1, -1, 0, 1, 1, 1, 0, -1)  # the eight neighbours in turn
 _COL_STEP = (0, 1, 1, 1, 0, -1, -1, -1)
 _FAR_AWAY = 1e30
-_PULL_CELLS = 1.0  # how exactly the farthest place in sight is sought
 
 
 @njit(cache=True, nogil=True)
@@ -497,8 +496,8 @@ def sees(squared: Any, need: float, r0: float, c0: float, r1: float, c1: float) 
     per_r = length / abs(dr) if dr != 0.0 else _FAR_AWAY
     per_c = length / abs(dc) if dc != 0.0 else _FAR_AWAY
     step_r, step_c = (1 if dr > 0.0 else -1), (1 if dc > 0.0 else -1)
-    leave_r = (0.5 + step_r * (r - r0)) * per_r
-    leave_c = (0.5 + step_c * (c - c0)) * per_c
+    leave_r = (0.5 + step_r * (r - r0)) * per_r if dr != 0.0 else _FAR_AWAY
+    leave_c = (0.5 + step_c * (c - c0)) * per_c if dc != 0.0 else _FAR_AWAY
     on = 0.0
     while True:
         value = squared[r, c]
@@ -514,8 +513,8 @@ def sees(squared: Any, need: float, r0: float, c0: float, r1: float, c1: float) 
             if t > leave:
                 on = t
                 r, c = math.floor(r0 + t / length * dr + 0.5), math.floor(c0 + t / length * dc + 0.5)
-                leave_r = (0.5 + step_r * (r - r0)) * per_r
-                leave_c = (0.5 + step_c * (c - c0)) * per_c
+                leave_r = (0.5 + step_r * (r - r0)) * per_r if dr != 0.0 else _FAR_AWAY
+                leave_c = (0.5 + step_c * (c - c0)) * per_c if dc != 0.0 else _FAR_AWAY
                 continue
         if min(leave_r, leave_c) >= length:
             return True
@@ -526,165 +525,6 @@ def sees(squared: Any, need: float, r0: float, c0: float, r1: float, c1: float) 
             r, leave_r = r + step_r, leave_r + per_r
         else:
             c, leave_c = c + step_c, leave_c + per_c
-
-
-@njit(cache=True, nogil=True)
-def measure_room(squared: Any, need: float, room: Any) -> None:
-    """room: (R, C) uint8 out, 0 where the distance is below `need`, else 1 + how many whole cells a way may go on from
-    anywhere in the cell without looking."""
-    need2 = need * need
-    told = np.empty(1 << 16, dtype=np.uint8)
-    for value in range(told.size):
-        more = math.sqrt(value) - need - 1.4143
-        told[value] = 0 if value < need2 else min(1 + max(int(more), 0), 255)
-    rows, cols = squared.shape
-    for r in range(rows):
-        for c in range(cols):
-            room[r, c] = told[min(squared[r, c], told.size - 1)]
-
-
-@njit(cache=True, nogil=True)
-def sees_by_room(room: Any, r0: float, c0: float, r1: float, c1: float) -> bool:
-    """What `sees` says, with the table that measure_room made; both points within the grid."""
-    r, c = int(r0 + 0.5), int(c0 + 0.5)
-    if room[int(r1 + 0.5), int(c1 + 0.5)] == 0:
-        return False
-    dr, dc = r1 - r0, c1 - c0
-    length = math.sqrt(dr * dr + dc * dc)
-    if length == 0.0:
-        return True
-    ur, uc = dr / length, dc / length
-    per_r, per_c = 1.0 / max(abs(ur), 1e-30), 1.0 / max(abs(uc), 1e-30)
-    step_r, step_c = (1 if dr > 0.0 else -1), (1 if dc > 0.0 else -1)
-    leave_r = (0.5 + step_r * (r - r0)) * per_r
-    leave_c = (0.5 + step_c * (c - c0)) * per_c
-    on = 0.0
-    while True:
-        value = room[r, c]
-        if value == 0:
-            return False
-        leave = min(leave_r, leave_c)
-        if value > 3:
-            on = max(leave, on) + (value - 2.5)  # less what the line takes through this cell, at most, and 1
-            if on >= length:
-                return True
-            r, c = int(r0 + on * ur + 0.5), int(c0 + on * uc + 0.5)
-            leave_r = (0.5 + step_r * (r - r0)) * per_r
-            leave_c = (0.5 + step_c * (c - c0)) * per_c
-            continue
-        if leave >= length:
-            return True
-        if abs(leave_r - leave_c) < 1e-6:  # through a corner
-            r, c = r + step_r, c + step_c
-            leave_r, leave_c = leave_r + per_r, leave_c + per_c
-        elif leave_r < leave_c:
-            r, leave_r = r + step_r, leave_r + per_r
-        else:
-            c, leave_c = c + step_c, leave_c + per_c
-
-
-@njit(cache=True, nogil=True)
-def straighten(room: Any, point: Any, n: int, out: Any) -> Any:
-    """Leave out every point that is not needed: from each, on to the farthest that it sees, sought in doubling steps.
-
-    room: (R, C) from measure_room.
-    point: (N, 2) float64, each seeing the next.  out: (N, 2) float64 out; returns how many points are left.
-    """
-    out[0] = point[0]
-    m, i = 1, 0
-    while i < n - 1:
-        good, step = i + 1, 2
-        while True:
-            ahead = min(i + step, n - 1)
-            if ahead <= good:
-                break
-            if not sees_by_room(room, point[i, 0], point[i, 1], point[ahead, 0], point[ahead, 1]):
-                bad = ahead
-                while bad - good > 1:
-                    middle = (good + bad) >> 1
-                    if sees_by_room(room, point[i, 0], point[i, 1], point[middle, 0], point[middle, 1]):
-                        good = middle
-                    else:
-                        bad = middle
-                break
-            good = ahead
-            step *= 2
-        i = good
-        out[m] = point[i]
-        m += 1
-    return m
-
-
-@njit(cache=True, nogil=True)
-def length_of(point: Any, n: int) -> float:
-    """Of a way of n points."""
-    total = 0.0
-    for i in range(n - 1):
-        total += math.hypot(point[i + 1, 0] - point[i, 0], point[i + 1, 1] - point[i, 1])
-    return total
-
-
-@njit(cache=True, nogil=True)
-def pull(room: Any, point: Any, n: int, out: Any) -> Any:
-    """From each place straight on to the farthest of the way that it sees, on to the next corner and as far into the
-    run behind it as can be; how many corners are left.
-
-    point: (N, 2) float64, each seeing the next.  out: (M, 2) float64 out, as long as point.
-    """
-    out[0] = point[0]
-    m, ahead = 1, 1
-    r, c = point[0, 0], point[0, 1]
-    while True:
-        while ahead + 1 < n and sees_by_room(room, r, c, point[ahead + 1, 0], point[ahead + 1, 1]):
-            ahead += 1
-        r0, c0 = point[ahead, 0], point[ahead, 1]
-        if ahead == n - 1:
-            out[m, 0], out[m, 1] = r0, c0
-            return m + 1
-        dr, dc = point[ahead + 1, 0] - r0, point[ahead + 1, 1] - c0
-        length = math.sqrt(dr * dr + dc * dc)
-        seen, hidden = 0.0, 1.0
-        while (hidden - seen) * length > _PULL_CELLS:
-            middle = 0.5 * (seen + hidden)
-            if sees_by_room(room, r, c, r0 + middle * dr, c0 + middle * dc):
-                seen = middle
-            else:
-                hidden = middle
-        r, c = r0 + seen * dr, c0 + seen * dc
-        out[m, 0], out[m, 1] = r, c
-        m += 1
-        ahead += 1
-
-
-@njit(cache=True, nogil=True)
-def turned_round(point: Any, n: int) -> None:
-    """The way backwards, in place."""
-    for i in range(n // 2):
-        for k in range(2):
-            point[i, k], point[n - 1 - i, k] = point[n - 1 - i, k], point[i, k]
-
-
-@njit(cache=True, nogil=True)
-def taut(room: Any, point: Any, n: int, rounds: int, work: Any) -> Any:
-    """Pull a way straight, from both ends in turn, until it gets no shorter; in place, and how many points it has.
-
-    point, work: (M, 2) float64, M at least n.
-    """
-    n = straighten(room, point, n, work)
-    before = length_of(work, n)
-    for turn in range(rounds):
-        turned_round(work, n)
-        n = pull(room, work, n, point)
-        now = length_of(point, n)
-        work[:n] = point[:n]
-        if turn % 2 == 1:
-            if now > before * 0.999:
-                break
-            before = now
-    if rounds % 2 == 1:
-        turned_round(work, n)
-    point[:n] = work[:n]
-    return n
 
 
 @njit(cache=True, nogil=True)
@@ -703,8 +543,8 @@ def least_along(squared: Any, point: Any, n: int) -> Any:
         per_r = length / abs(dr) if dr != 0.0 else _FAR_AWAY
         per_c = length / abs(dc) if dc != 0.0 else _FAR_AWAY
         step_r, step_c = (1 if dr > 0.0 else -1), (1 if dc > 0.0 else -1)
-        leave_r = (0.5 + step_r * (r - r0)) * per_r
-        leave_c = (0.5 + step_c * (c - c0)) * per_c
+        leave_r = (0.5 + step_r * (r - r0)) * per_r if dr != 0.0 else _FAR_AWAY
+        leave_c = (0.5 + step_c * (c - c0)) * per_c if dc != 0.0 else _FAR_AWAY
         on = 0.0
         while True:
             value = np.int64(squared[r, c])
@@ -719,8 +559,8 @@ def least_along(squared: Any, point: Any, n: int) -> Any:
                 if t > leave:
                     on = t
                     r, c = math.floor(r0 + t / length * dr + 0.5), math.floor(c0 + t / length * dc + 0.5)
-                    leave_r = (0.5 + step_r * (r - r0)) * per_r
-                    leave_c = (0.5 + step_c * (c - c0)) * per_c
+                    leave_r = (0.5 + step_r * (r - r0)) * per_r if dr != 0.0 else _FAR_AWAY
+                    leave_c = (0.5 + step_c * (c - c0)) * per_c if dc != 0.0 else _FAR_AWAY
                     continue
             if min(leave_r, leave_c) >= length:
                 break

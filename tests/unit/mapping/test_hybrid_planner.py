@@ -10,10 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from mapping.hybrid.corners import packed
 from mapping.hybrid.planner import HALF_CELLS, NoWayError, Planner, Way, graph_of
 from mapping.hybrid.voronoi import VoronoiGrid
 from mapping.kernels import paths as kernels
 from mapping.kernels.rooms import connected
+from mapping.kernels.sight import measure_room, sees_open
 
 Bools = NDArray[np.bool_]
 CELL_M = 0.05
@@ -137,7 +139,7 @@ def test_where_corners_know_no_way_the_diagram_does() -> None:
     places = np.argwhere(grid.field.squared >= (0.1 / CELL_M + HALF_CELLS) ** 2).tolist()
     ends = places[0], places[-1]
     with_corners = planner.plan(place(*ends[0]), place(*ends[1]), clearance_m=0.1)
-    planner._tables_for(0.1 / CELL_M + HALF_CELLS).corners._first[:] = 0  # nothing joins them
+    planner._tables_for(0.1 / CELL_M + HALF_CELLS).corners.forget_links()
     without = planner.plan(place(*ends[0]), place(*ends[1]), clearance_m=0.1)
     assert with_corners.way.length_m <= without.way.length_m <= 1.1 * with_corners.way.length_m
 
@@ -240,19 +242,24 @@ def test_shortest_way_is_that_of_networkx() -> None:
             assert last == -1
 
 
+def sight_of(squared: NDArray[np.int32], need: float) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    room = np.empty(squared.shape, dtype=np.uint8)
+    measure_room(squared, need, room)
+    return packed(room), packed(room.T)
+
+
 @pytest.mark.parametrize("need", [math.sqrt(2.0), 3.3])
-def test_sight_by_the_table_is_that_by_distances(need: float) -> None:
+def test_sight_by_bits_is_that_by_distances(need: float) -> None:
     """And neither overlooks a cell that the line crosses."""
     grid = VoronoiGrid(cluttered(6))
     squared = grid.field.squared
-    room = np.empty(grid.shape, dtype=np.uint8)
-    kernels.measure_room(squared, need, room)
+    sight = sight_of(squared, need)
     random = np.random.default_rng(1)
     places = np.argwhere(squared >= need * need)
     seen = 0
     for a, b in random.integers(len(places), size=(3000, 2)).tolist():
         (r0, c0), (r1, c1) = (places[i] + random.uniform(-0.49, 0.49, 2) for i in (a, b))
-        told = kernels.sees_by_room(room, r0, c0, r1, c1)
+        told = sees_open(*sight, r0, c0, r1, c1)
         assert told == kernels.sees(squared, need, r0, c0, r1, c1)
         t = np.linspace(0.0, 1.0, 4000)
         cells = np.floor(np.stack((r0 + t * (r1 - r0), c0 + t * (c1 - c0)), axis=-1) + 0.5).astype(int)
@@ -276,19 +283,31 @@ def test_sight_along_the_borders_of_cells_comes_to_an_end() -> None:
     free = np.zeros((60, 200), dtype=np.bool_)
     free[2:58, 2:198] = True
     squared = VoronoiGrid(free).field.squared
-    room = np.empty(squared.shape, dtype=np.uint8)
-    kernels.measure_room(squared, 3.0, room)
+    sight = sight_of(squared, 3.0)
     for lean in (0.0, 1e-17, -1e-15, 1e-12, -1e-9, 1e-6):
         for at in (20.5, 30.0, 30.5):
             for a, b in ((10.0, 180.5), (180.5, 10.0), (10.5, 180.5)):
-                assert kernels.sees_by_room(room, at, a, at + lean, b)
+                assert sees_open(*sight, at, a, at + lean, b)
                 assert kernels.sees(squared, 3.0, at, a, at + lean, b)
     tall = np.ascontiguousarray(squared.T)
-    room = np.ascontiguousarray(room.T)
+    sight = sight_of(tall, 3.0)
     for at in (20.5, 30.0, 30.5):
         for a, b in ((10.0, 180.5), (180.5, 10.0)):
-            assert kernels.sees_by_room(room, a, at, b, at)
+            assert sees_open(*sight, a, at, b, at)
             assert kernels.sees(tall, 3.0, a, at, b, at)
+
+
+def test_a_way_along_a_border_of_cells_lies_in_one_row_of_them() -> None:
+    """It was measured by the row before, too, which the way does not cross."""
+    free = np.ones((30, 40), dtype=np.bool_)
+    free[14, 10:30] = False
+    squared = VoronoiGrid(free).field.squared
+    for way in (np.array([[15.5, 8.0], [15.5, 32.0]]), np.array([[15.5, 32.0], [15.5, 8.0]])):
+        assert sees_open(*sight_of(squared, 2.0), *way[0], *way[1])
+        assert kernels.sees(squared, 2.0, *way[0], *way[1])
+        assert kernels.least_along(squared, way, 2) == 4
+        assert not sees_open(*sight_of(squared, 2.1), *way[0], *way[1])
+        assert not kernels.sees(squared, 2.1, *way[0], *way[1])
 
 
 def test_a_way_of_more_poses_than_there_is_room_for() -> None:
