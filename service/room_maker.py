@@ -555,7 +555,8 @@ def _middle(cell: tuple[int, int], grid: GridPatch) -> tuple[float, float]:
 
 
 def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    """Of a size that may be reckoned with; not NaN, nor an int that no float holds."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and -1e9 <= value <= 1e9
 
 
 def _rounded(values: Any) -> list[float]:

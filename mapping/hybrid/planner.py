@@ -165,8 +165,14 @@ class Planner:
         pulled.sort(key=lambda corners: float(length_of(corners, len(corners))))
         kept = pulled[:1]
         for corners in pulled[1:]:
-            if len(kept) <= alternatives and all(_goes_elsewhere(corners, other) for other in kept):
+            if len(kept) > alternatives or not all(_goes_elsewhere(corners, other) for other in kept):
+                continue
+            direct = self._by_way_of(_farthest_off(corners, kept[0]), begin, end, need)
+            if direct is None:
                 kept.append(corners)
+            elif all(_goes_elsewhere(direct, other) for other in kept):
+                kept.append(direct)
+        kept.sort(key=lambda corners: float(length_of(corners, len(corners))))
         described = [self._describe(corners) for corners in kept]
         return Plan(described[0], tuple(described[1:]))
 
@@ -202,6 +208,19 @@ class Planner:
             ways.append(self._taut(self._on_grid(begin, end, need, margin=max(self.grid.shape)), begin, end, need))
         return ways
 
+    def _by_way_of(self, place: F64, begin: F64, end: F64, need: float) -> F64 | None:
+        """Corners of the way over a place that is short before it and after; None if corners know none.
+
+        A way of the diagram that has to be another winds about furniture at its ends, where it could go as others do.
+        """
+        corners = self._tables_for(need).corners
+        to, on = corners.way(begin, place), corners.way(place, end)
+        if to is None or on is None:
+            return None
+        points = np.concatenate((to, on[1:]))
+        n = int(taut(*corners.sight, points, len(points), _PULLS, np.empty_like(points)))
+        return points[:n].copy()
+
     def _are_joined(self, begin: F64, end: F64, need: float) -> bool:
         """Whether the cells of both hang together."""
         part = self._tables_for(need).part
@@ -226,10 +245,10 @@ class Planner:
 
     def _cell(self, what: str, place: tuple[float, float], need: float) -> tuple[float, float]:
         """(row, col) in cells, a cell's centre at whole numbers; NoWayError if it is not free enough."""
-        if not (math.isfinite(place[0]) and math.isfinite(place[1])):
-            raise ValueError(f"the {what} is no position: {place}")
         at_row = place[1] / self.resolution_m - self.row0 - 0.5
         at_col = place[0] / self.resolution_m - self.col0 - 0.5
+        if not (math.isfinite(at_row) and math.isfinite(at_col)):
+            raise ValueError(f"the {what} is no position: {place}")
         row, col = math.floor(at_row + 0.5), math.floor(at_col + 0.5)
         height, width = self.grid.shape
         inside = 0 <= row < height and 0 <= col < width
@@ -425,6 +444,14 @@ def _goes_elsewhere(corners: F64, other: F64) -> bool:
     away = np.hypot(mine[:, None, 0] - others[:, 0], mine[:, None, 1] - others[:, 1]).min(axis=1)
     step = np.hypot(*(others[1] - others[0]))
     return bool(np.mean(away > max(10.0, step)) >= _ELSEWHERE)
+
+
+def _farthest_off(corners: F64, other: F64) -> F64:
+    """The point of a way that is farthest from another."""
+    mine, others = _samples(corners), _samples(other)
+    away = np.hypot(mine[:, None, 0] - others[:, 0], mine[:, None, 1] - others[:, 1]).min(axis=1)
+    farthest: F64 = mine[int(np.argmax(away))]
+    return farthest
 
 
 def _samples(corners: F64, count: int = 64) -> F64:

@@ -165,6 +165,30 @@ def test_two_openings_give_an_alternative() -> None:
     assert plan.alternatives[0].poses[:, 1].max() > 75 * CELL_M
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_an_alternative_winds_about_no_furniture(seed: int) -> None:
+    """It is as short as the way is when the other opening is shut; boxes near both ends tempt it to go round them on
+    the side where the first does not."""
+    random = np.random.default_rng(seed)
+    free = np.zeros((100, 160), dtype=np.bool_)
+    free[2:-2, 2:-2] = True
+    free[:, 80] = False
+    for left in (10, 115):
+        for r, c in random.integers((15, left), (85, left + 30), size=(8, 2)).tolist():
+            free[r : r + 4, c : c + 4] = False
+    free[10:22, 80] = free[78:90, 80] = True
+    shut = free.copy()
+    shut[78:90, 80] = False
+    other = free.copy()
+    other[10:22, 80] = False
+    ends = place(45, 6), place(45, 153)
+    plan = Planner(VoronoiGrid(free), CELL_M).plan(*ends, clearance_m=0.1)
+    lengths = [Planner(VoronoiGrid(f), CELL_M).plan(*ends, clearance_m=0.1).way.length_m for f in (shut, other)]
+    assert plan.way.length_m <= 1.03 * min(lengths)
+    assert len(plan.alternatives) >= 1
+    assert plan.alternatives[0].length_m <= 1.03 * max(lengths)
+
+
 def test_clearance_closes_a_narrow_door() -> None:
     free = np.zeros((60, 90), dtype=np.bool_)
     free[2:-2, 2:-2] = True
@@ -189,6 +213,8 @@ def test_ends_must_be_free_and_say_how_free_they_are() -> None:
         planner.plan(inside, (40 * CELL_M + 0.3, -100 * CELL_M + 1.0), clearance_m=0.4)
     with pytest.raises(ValueError, match="no position"):
         planner.plan((math.nan, 0.0), inside)
+    with pytest.raises(ValueError, match="no position"):
+        planner.plan(inside, (1e308, 0.0))
     with pytest.raises(ValueError, match="clearance_m"):
         planner.plan(inside, inside, clearance_m=-0.1)
     still = planner.plan(inside, inside)
