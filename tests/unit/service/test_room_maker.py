@@ -297,3 +297,15 @@ def test_it_is_built_from_the_configuration() -> None:
     config = Config.model_validate({"rooms": {"enabled": True, "period_s": 2.0}})
     (maker,) = (m for m in assemble_makers.map_makers(config, {}) if isinstance(m, RoomMaker))
     assert maker.period_ns == 2_000_000_000
+
+
+@pytest.mark.parametrize("huge", [1e308, -1e300, 10**400, -(10**400)])
+def test_numbers_beyond_all_measure_are_refused_in_words(huge: float) -> None:
+    """They were answered with an internal error: no float holds the int, no int the float over the size of a cell."""
+    maker = RoomMaker(settle_turns=1)
+    told(maker, house(), standing_at(10, 10))
+    for arguments in ({"goal": [huge, 1.0]}, {"goal": [20.0, 1.0], "start": [20.0, huge]}):
+        with pytest.raises(CallRefused, match="is a position"):
+            maker.plan(arguments)
+    with pytest.raises(CallRefused, match="is a length"):
+        maker.plan({"goal": at(40, 80), "clearance_m": huge})
