@@ -251,7 +251,7 @@ class _Pieces:
         kernels.count_ruled(field.site, field.squared, ruled)
         sharpness = np.empty((len(points), 3))
         apart, around = max(round(_ENDS_APART_M / resolution_m), 1), _END_M / resolution_m
-        at = widest[:, kernels.ROW :]
+        at = np.ascontiguousarray(widest[:, kernels.ROW :])  # of one row or many the same kind to the compiler
         least, most, beside = (length / resolution_m for length in (*_LEAF_M, _LEAF_FREE_M))
         layers = (field.site, field.squared)
         lines = kernels.door_lines(*layers, at, first, apart, 0.8 * least, most)

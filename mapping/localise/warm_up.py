@@ -41,7 +41,9 @@ def warm_up() -> None:
         raster = raster_of(snapshot.views, rows, snapshot.poses, window_m=window_m)
         find_view(view, raster, Pose2(), window_m=window_m, turn_rad=0.1)
     slam.finish()
-    is_changed(scan, depths_of(scan, table_for(bearing)), np.zeros((len(bearing), 3)), Pose2())
+    for _ in range(2):  # sweeps of the daemon share their bearings, which nobody may write: another kind of array
+        is_changed(scan, depths_of(scan, table_for(bearing)), np.zeros((len(bearing), 3)), Pose2())
+        bearing.setflags(write=False)
     kept = kept_sweep("", scan, key=0, in_key=np.zeros((2, 3)))
     kept.poses(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.1]]), np.zeros(3))
 

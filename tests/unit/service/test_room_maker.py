@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -309,3 +311,51 @@ def test_numbers_beyond_all_measure_are_refused_in_words(huge: float) -> None:
             maker.plan(arguments)
     with pytest.raises(CallRefused, match="is a length"):
         maker.plan({"goal": at(40, 80), "clearance_m": huge})
+
+
+def test_warming_up_leaves_nothing_to_compile() -> None:
+    """In a process of its own: no map of none, one or many rooms and doors brings kernels new kinds of arguments."""
+    code = """
+import contextlib, importlib, pkgutil
+import numpy as np
+from numba.core.registry import CPUDispatcher
+import mapping.kernels
+from mapping.frames import Pose2
+from mapping.grids.patch import GridPatch
+from service.map_makers import MapView, Rect
+from service.room_maker import RoomMaker, warm_up
+from service.rpc import CallRefused
+
+modules = [importlib.import_module(f"mapping.kernels.{m.name}") for m in pkgutil.iter_modules(mapping.kernels.__path__)]
+
+def compiled():
+    return {
+        f"{m.__name__}.{name}": len(kernel.signatures)
+        for m in modules for name, kernel in vars(m).items() if isinstance(kernel, CPUDispatcher)
+    }
+
+warm_up()
+before = compiled()
+one_door = np.full((60, 110), -1, np.int8)
+one_door[1:41, 1:41] = 100
+one_door[2:40, 2:40] = one_door[15:23, 40] = one_door[2:40, 41:80] = 0
+many = np.full((160, 200), 100, np.int8)
+for row in range(2):
+    for col in range(3):
+        many[5 + 75 * row : 75 + 75 * row, 5 + 65 * col : 65 + 65 * col] = 0
+many[75:80, 20:29] = many[75:80, 85:94] = many[75:80, 150:158] = many[30:39, 65:70] = many[110:118, 130:135] = 0
+many[60:75, 20] = many[100:104, 30:40] = many[20:24, 90:100] = 100
+for cells in (np.full((20, 20), -1, np.int8), np.zeros((20, 20), np.int8), one_door, many):
+    maker = RoomMaker(settle_turns=1)
+    for turn in range(3):
+        cells[10 + turn, 10] = 100
+        changed = Rect(0, 0, *cells.shape) if turn == 0 else Rect(8, 8, 8, 8)
+        maker.make(MapView(turn, GridPatch(0.1, 0, 0, cells), (changed,), Pose2(1.5, 1.5, 0.0)))
+    far = {"start": [1.0, 2.5], "goal": [17.0, 8.5], "alternatives": 3, "clearance_m": 0.2}
+    for wanted in ({"goal": [6.0, 2.5]}, far):
+        with contextlib.suppress(CallRefused):
+            maker.plan(wanted)
+new = {name: count for name, count in compiled().items() if count != before[name]}
+assert not new, new
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[3]).returncode == 0
