@@ -258,17 +258,26 @@ def tracking(case: Case) -> dict[str, object]:
     }  # fmt: skip
 
 
-def kidnapping(case: Case, count: int, samples: list[Sample], *, seed: int = 11) -> dict[str, object]:
-    """Jumps of robots that were sure and right: how long still sure of the wrong place, and when sure of the right."""
+def kidnapping(
+    case: Case, count: int, samples: list[Sample], *, seed: int = 11, watch_s: float = 20.0
+) -> dict[str, object]:
+    """Jumps of robots that were sure and right: how long still sure of the wrong place, and when sure of the right.
+
+    watch_s: of driving after the jump that are looked at, fewer where the run ends.  wrong_at_the_end: those whose best
+    place was wrong then, sure or not.
+    """
+    way = driven(case)
     pieces = starts_of(case, 4 * count, 20.0, seed=seed)
     wrong_s: list[float] = []
     longest_s: list[float] = []
     back_s: list[float] = []
-    not_back = 0
+    not_back = not_right = 0
     for (first, end), (other, other_end) in zip(pieces[0::2], pieces[1::2]):
         if len(wrong_s) >= count or abs(other - first) < 50:
             continue
         before, standing = range(first, end), [other] * (15 * (len(wrong_s) % 2))
+        if watch_s > 20.0:
+            other_end = min(int(np.searchsorted(way, way[other] + watch_s)), case.last)
         played = play(case, [*before, *standing, *range(other, other_end)])
         samples += samples_of(case, played)
         index, jump_s, located = played[len(before) - 1]
@@ -283,6 +292,7 @@ def kidnapping(case: Case, count: int, samples: list[Sample], *, seed: int = 11)
         came = next((s for s, sure, right in states if sure and right), None)
         back_s += [] if came is None else [came]
         not_back += came is None
+        not_right += not states[-1][2]
     if not wrong_s:
         return {"jumps": 0}
     return {
@@ -290,7 +300,9 @@ def kidnapping(case: Case, count: int, samples: list[Sample], *, seed: int = 11)
         "said_within_5_s": round(float(np.mean(np.array(wrong_s) <= 5.0)), 3),
         "said_median_s": round(float(np.median(wrong_s)), 2), "said_largest_s": round(float(np.max(wrong_s)), 2),
         "wrong_for_more_than_5_s": int(np.sum(np.array(longest_s) > 5.0)),
-        "back_median_s": round(float(np.median(back_s)), 2) if back_s else None, "not_back": not_back,
+        "back_median_s": round(float(np.median(back_s)), 2) if back_s else None,
+        "back_largest_s": round(float(np.max(back_s)), 2) if back_s else None, "not_back": not_back,
+        "wrong_at_the_end": not_right,
     }  # fmt: skip
 
 
@@ -368,6 +380,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", default=list(ALL), choices=ALL)
     parser.add_argument("--starts", type=int, default=200)
     parser.add_argument("--kidnaps", type=int, default=40)
+    parser.add_argument("--watch-s", type=float, default=20.0, help="driving that is looked at after a jump")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--no-tracking", action="store_true")
     parser.add_argument("--fit", action="store_true")
@@ -386,7 +399,7 @@ def main() -> None:
         report[case.name] = {
             **({} if asked.no_tracking else {"tracking": tracking(case)}),
             "start": global_starts(case, asked.starts, seen, seed=asked.seed),
-            "kidnapping": kidnapping(case, asked.kidnaps, seen, seed=asked.seed + 4),
+            "kidnapping": kidnapping(case, asked.kidnaps, seen, seed=asked.seed + 4, watch_s=asked.watch_s),
             "told": told(seen) if seen else {},
             "reliability": reliability(seen),
         }
