@@ -75,7 +75,7 @@ class BoundedQueue(Generic[ItemT]):
     def _wait(self, timeout_s: float | None) -> None:
         """Until there is an item, or for timeout_s."""
         with self._lock:
-            if self._items or timeout_s == 0.0:
+            if self._items or (timeout_s is not None and timeout_s <= 0.0):
                 return
             self._waiting = True
         if self._bell.acquire(timeout=-1 if timeout_s is None else min(timeout_s, threading.TIMEOUT_MAX)):

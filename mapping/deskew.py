@@ -33,11 +33,6 @@ class Deskewed:
     odom_from_sensor: Pose2
     origin_m: F64
 
-    @property
-    def spread_m(self) -> float:
-        """The largest distance of an origin from the frame's own."""
-        return float(np.hypot(self.origin_m[:, 0], self.origin_m[:, 1]).max(initial=0.0))
-
 
 def beam_stamps(scan: Scan) -> NDArray[np.int64]:
     """(N,) when each beam was measured."""

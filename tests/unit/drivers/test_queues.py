@@ -44,6 +44,7 @@ def test_nothing_is_lost_and_no_ring_is_left_over_around_time_outs() -> None:
 def test_without_time_to_wait_it_does_not_wait() -> None:
     queue: BoundedQueue[int] = BoundedQueue(10)
     assert queue.get_all(0.0) == []
+    assert queue.get_all(-1.0) == []  # a deadline that has passed: no wait for ever
     assert queue.get(0.0) is None
     queue.put("a", 1)
     queue.put("b", 2)
