@@ -335,7 +335,9 @@ class _Source(Generic[WireT]):
         self._loop_trouble: str | None = None  # what the loop found wrong: silence, a bug
         self._broken_until_ns: int | None = None  # after a bug: left alone until then
         self._restart_backoff = _Backoff()
-        self._alive_ns = 0  # last reading, or when RUNNING was entered
+        self._life_ns = 0  # last reading, or when RUNNING was entered
+        self._alive_ns = 0  # the same, and what was forgiven since
+        self._longest_ns = 0  # the longest that was forgiven since
         self._setup_ns = 0  # when the conversation was last (re)started or moved on
         self._seen_state: LinkState | None = None
         self._told: tuple[LinkState, str, Identity | None] | None = None
@@ -362,6 +364,7 @@ class _Source(Generic[WireT]):
 
     def forgive(self, held_up_ns: int, now_ns: int) -> None:
         """The reader was held up for so long in the turn that ends now."""
+        self._longest_ns = max(self._longest_ns, held_up_ns)
         self._alive_ns = min(self._alive_ns + held_up_ns, max(now_ns, self._alive_ns))
         self._setup_ns = min(self._setup_ns + held_up_ns, max(now_ns, self._setup_ns))
 
@@ -411,7 +414,7 @@ class _Source(Generic[WireT]):
         """When it will be silent if nothing comes; latest_ns if it is, or if it does not run."""
         if self._seen_state is not LinkState.RUNNING or self._loop_trouble or self._broken_until_ns is not None:
             return latest_ns
-        return self._alive_ns + self._limit_ns
+        return self._quiet_since_ns() + self._limit_ns
 
     def check(self, now_ns: int, heard_out_ns: int) -> None:
         """Notice silence, set-up that does not end, and changes worth telling."""
@@ -460,18 +463,30 @@ class _Source(Generic[WireT]):
             if state in (LinkState.STARTING, LinkState.RUNNING):
                 self._loop_trouble = None  # it answers again
             if state is LinkState.RUNNING:
-                self._alive_ns = max(self._alive_ns, now_ns)
+                self._note_life(max(self._alive_ns, now_ns))
         limit_ns = self._limit_ns = self._silence_limit_ns()
         if state is LinkState.RUNNING:
-            silence_ns = heard_out_ns - self._alive_ns
+            silence_ns = heard_out_ns - self._quiet_since_ns()
             if silence_ns >= limit_ns:
-                self._loop_trouble = f"no reading for {silence_ns / 1e9:.2f} s: check its power and cable"
+                unheard_s = (heard_out_ns - self._life_ns) / 1e9
+                self._loop_trouble = f"no reading for {unheard_s:.2f} s: check its power and cable"
                 if silence_ns >= max(limit_ns + _SILENCE_PATIENCE_NS, _SHORTEST_BEFORE_RESET_NS):
                     self._restart_when_due(now_ns)
             else:
                 self._loop_trouble = None
         elif now_ns - self._setup_ns > _SETUP_LIMIT_NS:
             self._restart(now_ns)
+
+    def _note_life(self, stamp_ns: int) -> None:
+        self._life_ns = self._alive_ns = stamp_ns
+        self._longest_ns = 0
+
+    def _quiet_since_ns(self) -> int:
+        """From when silence counts: the last reading, and what was forgiven since.
+
+        However often this thread was held up, a silence is told 500 ms after the last reading and its longest hold-up.
+        """
+        return min(self._alive_ns, self._life_ns + self._longest_ns + max(MOST_SILENCE_NS - self._limit_ns, 0))
 
     def _silence_limit_ns(self) -> int:
         """What the conversation says; more where the device takes longer, or is held back on its way.
@@ -511,7 +526,7 @@ class _Source(Generic[WireT]):
         self._readings += 1
         if self._last_reading_ns is not None:
             self._hold_ups.count(stamp_ns, stamp_ns - self._alive_ns)
-        self._alive_ns = stamp_ns
+        self._note_life(stamp_ns)
         self._last_reading_ns = stamp_ns
         self._loop_trouble = None
         self._restart_backoff.note_life(stamp_ns)

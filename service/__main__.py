@@ -13,9 +13,11 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
+import signal
 import sys
-from collections.abc import Sequence
-from types import ModuleType
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType, ModuleType
 
 import typer
 
@@ -46,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point: runs one command and ends the process with its exit code."""
     argv = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        build_app(_called_command(argv))(args=argv, prog_name="umfeld")
+        with _ending_in_order():
+            build_app(_called_command(argv))(args=argv, prog_name="umfeld")
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # the reader of our output went away, e.g. `| head`
@@ -54,6 +57,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(1)
     except Exception as error:
         sys.exit(_explain(error))
+
+
+@contextmanager
+def _ending_in_order() -> Iterator[None]:
+    """SIGTERM, and SIGHUP of a terminal that is closed, unwind the command as Ctrl-C does: devices are left safe."""
+    numbers = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) is signal.SIG_DFL]
+    for number in numbers:
+        signal.signal(number, _end)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _end(number: int, _frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
 
 
 def build_app(called: str | None) -> typer.Typer:

@@ -90,7 +90,7 @@ class Daemon:
     # --- the life of the process
 
     def run(self, *, seconds: float = 0.0) -> int:
-        """Start, wait for SIGINT or SIGTERM, stop; returns the exit code. Trouble if it cannot start.
+        """Start, wait until told to stop, stop; returns the exit code. Trouble if it cannot start.
 
         seconds: end by itself so long after it was ready; 0: when told.
         """
@@ -503,10 +503,11 @@ class _Beside:
 
 
 class _StopSignals:
-    """SIGINT and SIGTERM ask to stop; the second one ends the process at once. A context manager.
+    """SIGINT, SIGTERM and a closed terminal ask to stop; a second SIGINT or SIGTERM ends the process at once.
 
-    The handler only counts: anything with a lock in it could meet itself. A pipe, written by the interpreter's own
-    handler in whichever thread the signal arrives, wakes the main thread.
+    A context manager. Under nohup a daemon outlives its terminal; of a closed one it may be told twice. The handler
+    only counts: anything with a lock in it could meet itself. A pipe, written by the interpreter's own handler in
+    whichever thread the signal arrives, wakes the main thread.
     """
 
     def __init__(self) -> None:
@@ -514,7 +515,10 @@ class _StopSignals:
 
     def __enter__(self) -> _StopSignals:
         self._reading, self._writing = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        heeded = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            heeded.append(signal.SIGHUP)
+        self._before = {number: signal.signal(number, self._handle) for number in heeded}
         self._wakeup_before = signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)
         return self
 
@@ -537,7 +541,7 @@ class _StopSignals:
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
         self._count += 1
-        if self._count > 1:
+        if self._count > 1 and number != signal.SIGHUP:
             os._exit(128 + number)
 
 

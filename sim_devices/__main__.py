@@ -1,8 +1,8 @@
 """`python -m sim_devices`: an emulated robot on ptys, in a simulated world or in a recorded log, in real time.
 
 Standard output gets one thing: a configuration with which `umfeld run` meets this robot; it also stands in
-DIR/umfeld.toml. All else goes to standard error. SIGINT and SIGTERM end it cleanly: exit code 0. Exit code 1: something
-is wrong with a file or a folder; 2: wrong usage.
+DIR/umfeld.toml. All else goes to standard error. SIGINT, SIGTERM and a closed terminal end it cleanly: exit code 0.
+Exit code 1: something is wrong with a file or a folder; 2: wrong usage.
 """
 
 from __future__ import annotations
@@ -139,8 +139,9 @@ def _default_folder() -> Path:
 def _ending_signals() -> list[int]:
     """Grows when the process is told to end."""
     told: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: told.append(number))
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # nohup: outlive the terminal
+            signal.signal(number, lambda number, _: told.append(number))
     return told
 
 

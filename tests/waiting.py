@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fcntl
 import socket
+import subprocess
 import termios
 import threading
 import time
@@ -72,6 +73,19 @@ def wait_for_input(descriptor: int, count: int) -> None:
         return waiting[0] >= count
 
     wait_for(f"{count} bytes of input", there, every_s=0.001)
+
+
+def kill_devices(process: subprocess.Popen[bytes], folder: Path) -> None:
+    """End emulated devices as if all their cables were pulled at once.
+
+    Their links go first: a killed process leaves them, and the terminal that such a link names is given to whoever
+    opens one next. A daemon that tries its port again would then speak to another test's device.
+    """
+    for link in folder.iterdir():
+        if link.is_symlink():
+            link.unlink()
+    process.kill()
+    process.wait()
 
 
 # --- time -----------------------------------------------------------------------------------------------------------

@@ -39,6 +39,8 @@ def demo(
     folder = keep or Path(tempfile.mkdtemp(prefix="umfeld-demo-"))
     folder.mkdir(parents=True, exist_ok=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # its terminal is closed; under nohup it outlives that
+        signal.signal(signal.SIGHUP, signal.default_int_handler)
     try:
         with Family(folder) as family, Claims() as claims:
             endpoint = _endpoint(claims)

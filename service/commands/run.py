@@ -24,7 +24,7 @@ def run(
         list[str] | None, typer.Option("--set", help="KEY=VALUE, wins over the file; repeatable.")
     ] = None,
 ) -> None:
-    """The daemon: devices in, maps out over Zenoh. Ends with SIGINT or SIGTERM.
+    """The daemon: devices in, maps out over Zenoh. Ends with SIGINT, SIGTERM or its terminal.
 
     Example: umfeld run --config /etc/umfeld/umfeld.toml
     """

@@ -17,7 +17,7 @@ import pytest
 from service.store import MapStore, occupancy_patch
 from service.zenoh_session import Client
 from tests.clients import connected, document
-from tests.waiting import GIVE_UP_S, START_S, free_port, wait_for
+from tests.waiting import GIVE_UP_S, START_S, free_port, kill_devices, wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 ROBOT = "robots/artos"
@@ -72,7 +72,7 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
     try:
         yield robot
     finally:
-        for process in robot.processes:
+        for process in reversed(robot.processes):  # devices last: see kill_devices
             process.kill()
             process.wait()
 
@@ -123,7 +123,8 @@ def test_a_robot_maps_loses_its_devices_gets_them_back_and_keeps_its_map(robot: 
         # The cables are pulled: every sector that was fed is stale within half a second, by the stamps of the maps.
         names = ("laser", "sonar_left")
         heard = {name: client.subscribe(f"{ROBOT}/sectors/polar/{name}", ring=4096) for name in names}
-        robot.stop(sim, signal.SIGKILL)
+        robot.processes.remove(sim)
+        kill_devices(sim, robot.folder)
         pulled_ns = time.time_ns()
         for name in names:
             for told in told_until(heard[name], pulled_ns + 2 * SECOND):
@@ -170,9 +171,13 @@ def test_without_devices_it_waits_and_says_so_and_a_second_daemon_is_refused(rob
     )
     daemon = robot.start_daemon()
     with connected(robot.endpoint, ROBOT) as client:
-        absent = wait_for("a report", lambda: device(client, "front"))
-        assert absent["state"] == "absent"
-        assert "plugged in" in absent["text"]
+
+        def is_told() -> bool:
+            """The first report may have been made before the port was tried."""
+            front = device(client, "front")
+            return front is not None and front["state"] == "absent" and "plugged in" in front["text"]
+
+        wait_for("word of the absent port", is_told)
     for changed, names in (
         ([], "laser-front is in use by another umfeld daemon"),
         (["--set", "lasers.front.port=/dev/none"], "writes this map"),

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+import pty
 import signal
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +30,17 @@ from sim_devices.attach import Attachment, PtyLink
 from sim_devices.device import Mount
 from sim_devices.laser_hokuyo import HokuyoLaser
 from sim_devices.laser_rplidar import RpLidar
-from tests.waiting import GIVE_UP_S, wait_for
+from tests.waiting import GIVE_UP_S, START_S, free_port, wait_for
 
 F64 = NDArray[np.float64]
+# A command that checks devices waits for this one.
+ABSENT_SONAR = """
+[sonars.side]
+driver = "maxbotix"
+family = "hr-5m"
+port = "/dev/none"
+transducers = [{channel = 1}]
+"""
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -110,6 +123,51 @@ def test_after_a_crash_stop_leaves_every_laser_dark(robot: Robot) -> None:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert [each["name"] for each in json.loads(done.stdout)] == ["front", "rear"]
+    wait_for("darkness", lambda: not robot.front.laser_is_on and not robot.rear.is_scanning)
+
+
+@pytest.mark.parametrize(
+    ("command", "number"),
+    [("run", signal.SIGHUP), ("check --seconds 600", signal.SIGTERM), ("devices identify", signal.SIGHUP)],
+)
+def test_a_command_leaves_devices_safe_when_its_terminal_is_closed(robot: Robot, command: str, number: int) -> None:
+    """Or when it is told to end. A lost ssh connection closes the terminal: SIGHUP, and no printing any more."""
+    settings = f'\n[network]\nlisten = ["tcp/127.0.0.1:{free_port()}"]\n[store]\nenabled = false\n'
+    robot.config.write_text(robot.config.read_text() + settings + ABSENT_SONAR)
+    terminal, end = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "service", *command.split(), "--config", str(robot.config)],
+        cwd=ROOT,
+        stdin=end,
+        stdout=end,
+        stderr=end,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )
+    os.close(end)
+    os.set_blocking(terminal, False)
+    said = b""
+
+    def are_on() -> bool:
+        nonlocal said
+        with suppress(BlockingIOError):
+            said += os.read(terminal, 4096)
+        assert process.poll() is None, said.decode()
+        return robot.front.laser_is_on and robot.rear.is_scanning
+
+    try:
+        wait_for("both lasers", are_on, START_S)
+        if number == signal.SIGHUP:
+            os.close(terminal)
+        else:
+            process.send_signal(number)
+        code = process.wait(GIVE_UP_S)
+    finally:
+        if process.poll() is None:
+            process.kill()
+        if number != signal.SIGHUP:
+            os.close(terminal)
+    assert code == (0 if command == "run" else 128 + number)
     wait_for("darkness", lambda: not robot.front.laser_is_on and not robot.rear.is_scanning)
 
 

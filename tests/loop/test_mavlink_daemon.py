@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.waiting import GIVE_UP_S, START_S, free_port, wait_for
+from tests.waiting import GIVE_UP_S, START_S, free_port, kill_devices, wait_for
 
 os.environ["MAVLINK20"] = "1"  # before pymavlink is imported
 
@@ -60,7 +60,7 @@ def hear(autopilot: Any, kind: str = "OBSTACLE_DISTANCE") -> Any:
 
 
 def test_an_autopilot_hears_obstacles_on_a_steady_beat_and_blindness_at_once(
-    robot: tuple[Any, subprocess.Popen[bytes]],
+    robot: tuple[Any, subprocess.Popen[bytes]], tmp_path: Path
 ) -> None:
     autopilot, devices = robot
     heartbeat = hear(autopilot, "HEARTBEAT")
@@ -81,8 +81,7 @@ def test_an_autopilot_hears_obstacles_on_a_steady_beat_and_blindness_at_once(
         hear(autopilot)
         heard_s.append(time.monotonic())
     assert np.median(np.diff(heard_s)) < 0.1  # at least ten a second; a machine that is held up is late for a few
-    devices.kill()
-    devices.wait()
+    kill_devices(devices, tmp_path)
     blind_usec = time.monotonic_ns() // 1000 + 500_000  # a message has the stamp of the map that it tells
     while (message := hear(autopilot)).time_usec < blind_usec:
         pass

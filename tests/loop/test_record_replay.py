@@ -77,7 +77,7 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
         wait_for("the devices", lambda: robot.config.exists() and (tmp_path / "laser-front").exists())
         yield robot
     finally:
-        for process in robot.processes:
+        for process in reversed(robot.processes):  # devices last: see kill_devices
             process.kill()
             process.wait()
 

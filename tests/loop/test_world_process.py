@@ -202,8 +202,16 @@ def test_a_log_is_played_to_its_end(tmp_path: Path) -> None:
 
 
 def test_a_fault_on_the_command_line_pulls_the_plug(tmp_path: Path) -> None:
-    folder = tmp_path / "sim"
-    with simulation(folder, "--fault", "laser:unplug@0s+3s") as process:
-        wait_for("the plug to be pulled", lambda: not (folder / "laser-front").exists())
-        wait_for("the wire to come back", lambda: (folder / "laser-front").exists())
+    pulled, back, clock = tmp_path / "pulled", tmp_path / "back", tmp_path / "truth.jsonl"
+    with simulation(pulled, "--fault", "laser:unplug@100ms") as process:
+        wait_for("the plug to be pulled", lambda: not (pulled / "laser-front").exists())
+        assert ended(process)[0] == 0
+
+    def has_run_s() -> float:
+        rows = truth(clock) if clock.exists() else []
+        return rows[-1]["t"] - rows[0]["t"] if rows else 0.0
+
+    with simulation(back, "--fault", "laser:unplug@0s+200ms", "--truth", str(clock)) as process:
+        wait_for("the end of the fault", lambda: has_run_s() > 0.4)
+        wait_for("the wire to come back", lambda: (back / "laser-front").exists())
         assert ended(process)[0] == 0

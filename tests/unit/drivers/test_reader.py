@@ -101,6 +101,8 @@ class ScriptedPort:
             self.bench.now_ns = max(self.bench.now_ns, min(due_ns, end_ns))
             self.bench.play()
         items, self.bench.inbox = self.bench.inbox, []
+        self.bench.now_ns += self.bench.late_ns
+        self.bench.play()
         return items
 
     def write(self, item: bytes) -> None:
@@ -123,6 +125,7 @@ class Bench:
 
     def __init__(self, *names: str, tap: Callable[[Direction, int, object], None] | None = None) -> None:
         self.now_ns = 0
+        self.late_ns = 0  # at which the thread goes on after each read
         self.inbox: list[tuple[bytes, int]] = []
         self.plan: list[tuple[int, Callable[[], object]]] = []
         self.talkers = {name: Talker() for name in names or ("front",)}
@@ -339,6 +342,22 @@ def test_a_thread_that_wakes_late_tells_nothing_of_what_came_meanwhile(late_ms: 
     bench.plan.sort(key=lambda each: each[0])
     bench.run_until(5_900)
     assert bench.states()[2:] == []
+
+
+@pytest.mark.parametrize("late_ms", [6, 20, 50, 100])
+@pytest.mark.parametrize("period_ms", [10, 25, 100, 200])
+def test_a_thread_that_is_late_at_every_turn_still_tells_a_silence(period_ms: int, late_ms: int) -> None:
+    """However many hold-ups are forgiven: 500 ms after the last reading, the longest hold-up, and one turn of such."""
+    bench = Bench()
+    bench.late_ns = late_ms * MS
+    bench.talker.silence_limit_ns = silence_limit(period_ms * MS)
+    bench.say_from_to(50, 5_000, period_ms)
+    last_ms = bench.plan[-1][0] // MS
+    bench.run_until(last_ms)
+    before = len(bench.states())
+    bench.run_until(8_000)
+    told_ms = next(at for at, state, _ in bench.events()[before:] if state is LinkState.SILENT)
+    assert told_ms - last_ms <= 500 + late_ms + 2 * (20 + late_ms)
 
 
 def test_a_device_slower_than_it_was_told_to_be_gets_three_of_its_own_periods() -> None:
