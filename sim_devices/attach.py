@@ -183,7 +183,8 @@ class PtyLink:
 class TcpLink:
     """A device that listens on a TCP port of the loopback interface; one host at a time, as such devices do.
 
-    port: 0 takes a free one, kept over a replug.
+    port: 0 takes a free one. While it is unplugged the port is kept, bound but deaf, as long as this link lives: hosts
+    are refused, and no other program is given it meanwhile.
     """
 
     def __init__(self, port: int = HOKUYO_TCP_PORT, host: str = "127.0.0.1") -> None:
@@ -193,6 +194,7 @@ class TcpLink:
         self.baud: int | None = None
         self.hosts_lost = 0
         self._listener: socket.socket | None = None
+        self._kept: socket.socket | None = None
         self._client: socket.socket | None = None
         self.open()
 
@@ -203,9 +205,7 @@ class TcpLink:
     def open(self) -> None:
         if self._listener is not None:
             return
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((self.host, self.port))
+        listener, self._kept = self._kept or self._bound(), None
         listener.listen(1)
         listener.setblocking(False)
         self.port = listener.getsockname()[1]
@@ -216,6 +216,17 @@ class TcpLink:
         if self._listener is not None:
             self._listener.close()
             self._listener = None
+            self._kept = self._bound()
+
+    def _bound(self) -> socket.socket:
+        bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # past connections that are being closed
+        bound.bind((self.host, self.port))
+        return bound
+
+    def __del__(self) -> None:
+        if self._kept is not None:
+            self._kept.close()
 
     def files(self) -> list[int]:
         return [end.fileno() for end in (self._listener, self._client) if end is not None]

@@ -50,16 +50,16 @@ def test_forty_scans_a_second_arrive_whole(tmp_path: Path) -> None:
         loop.add("laser", HokuyoLaser(Room(), profile=UTM_30LX, spin_up_s=0.0), PtyLink(tmp_path / "laser"))
         with loop, serial.Serial(str(tmp_path / "laser"), timeout=1) as port:
             assert ask(port, b"MD0000108001000\n") == b"MD0000108001000\n00P\n\n"
-            received = bytearray()
-            until_ns = clock() + 1_000_000_000
-            while clock() < until_ns:
+            received, began_ns = bytearray(), clock()
+            while clock() < began_ns + 1_000_000_000:
                 received += port.read(port.in_waiting or 1)
             port.write(b"QT\n")
             while not received.endswith(b"QT\n00P\n\n"):
                 received += port.read(port.in_waiting or 1)
+            passed_s = (clock() - began_ns) * 1e-9  # one second, and what this thread was held up at its end
     scans = bytes(received).split(b"\n\n")[:-2]
     assert {len(scan) for scan in scans} == {3370}
-    assert 35 <= len(scans) <= 44
+    assert 35 <= len(scans) <= 40 * passed_s + 4
 
 
 def test_baud_search_finds_the_urg_and_speeds_it_up(tmp_path: Path) -> None:

@@ -43,6 +43,13 @@ class Pty:
             data += os.read(self.master, count - len(data))
         return data
 
+    def receive_until(self, end: bytes) -> bytes:
+        """What comes, up to this: a pty may hand it on in pieces."""
+        data = b""
+        while not data.endswith(end):
+            data += os.read(self.master, 4096)
+        return data
+
     def unplug(self) -> None:
         for descriptor in (self.master, self.slave):
             with suppress(OSError):
@@ -367,6 +374,7 @@ def test_slcan_frames_carry_the_time_at_which_their_bytes_came(pty: Pty) -> None
 def test_slcan_serves_other_users_of_the_bus(pty: Pty) -> None:
     bus = LawicelBus(pty.path, bitrate_bps=1_000_000, clock=CLOCK)
     pty.send(b"t1232AABB\r")
+    wait_for_input(pty.slave, 10)
     message = bus.recv(GIVE_UP_S)
     assert message is not None
     assert (message.arbitration_id, bytes(message.data)) == (0x123, b"\xaa\xbb")
@@ -445,18 +453,26 @@ def test_slcan_understands_python_cans_own_client_and_the_other_way() -> None:
     other = can.Bus(interface="slcan", channel=theirs.path, bitrate=1_000_000, sleep_after_open=0, ignore_config=True)
     try:
         ours.receive(len(OPENING))
-        os.read(theirs.master, 4096)
         sent = [
             can.Message(arbitration_id=0x123, data=b"\1\2", is_extended_id=False),
             can.Message(arbitration_id=0x1ABCDEF0, data=bytes(range(8))),
             can.Message(arbitration_id=0x321, is_remote_frame=True, dlc=4, is_extended_id=False),
         ]
         for message in sent:
+            line = encode_line(
+                message.arbitration_id,
+                bytes(message.data),
+                message.is_extended_id,
+                message.is_remote_frame,
+                message.dlc,
+            )
             other.send(message)
-            ours.send(os.read(theirs.master, 4096))
+            theirs.receive_until(line)  # behind what it says to open the first time
+            ours.send(line)
             assert _same(bus.recv(GIVE_UP_S), message)
             bus.send(message)
-            theirs.send(os.read(ours.master, 4096))
+            assert ours.receive_until(line) == line
+            theirs.send(line)
             assert _same(other.recv(GIVE_UP_S), message)
     finally:
         bus.shutdown()

@@ -213,6 +213,8 @@ def test_tcp_serves_one_host_at_a_time_and_tells_the_device_when_it_goes() -> No
         wait_for("the unplugging", lambda: not link.is_open)
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection((link.host, link.port), GIVE_UP_S)
+        with socket.socket() as other, pytest.raises(OSError, match="in use"):
+            other.bind((link.host, link.port))  # the port is kept for its return
         with_loop.replug("device")
         wait_for("the port", lambda: link.is_open)
         with socket.create_connection((link.host, link.port), GIVE_UP_S) as host:
