@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from mapping.grids.geometry import check_resolution
 from mapping.grids.patch import GridPatch
 from mapping.kernels import clearance as kernels
+from mapping.kernels import clearance_reach
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 MAX_SIDE_CELLS = kernels.MAX_SIDE
@@ -49,7 +51,7 @@ class DistanceField:
     smallest column, then in the smallest row. Both are views to read, changed by the next update.
     reach_cells: what is farther from every obstacle than this counts as if there were none, so that a change costs
     what lies within reach of it and not what it rules of the map; None: any distance is kept.
-    Updated or made anew, the same obstacles give the same arrays. Memory: 9 bytes a cell.
+    Updated or made anew, the same obstacles give the same arrays. Memory: 9 bytes a cell, with a reach 11.
     Raises ValueError if obstacle is not (R, C) or has a side above 20,000, or for a reach below 0.
     """
 
@@ -64,7 +66,8 @@ class DistanceField:
         self.site: I32 = np.empty((rows, cols), dtype=np.int32)
         self._obstacle = obstacle.astype(np.uint8)
         self._reach = kernels.UNLIMITED if reach_cells is None else min(int(reach_cells), kernels.UNLIMITED)
-        self._half = kernels.half_widths(self._reach) if self._reach < kernels.UNLIMITED else None
+        self._half = clearance_reach.half_widths(self._reach) if self._reach < kernels.UNLIMITED else None
+        self._nearest: NDArray[np.int16] | None = None
         self._columns: NDArray[np.uint64] | None = None
         self._spans: I32 = np.empty((rows, 2), dtype=np.int32)
         self._work = [np.empty(cols + 1, dtype=np.int32) for _ in range(4)]
@@ -74,8 +77,10 @@ class DistanceField:
     def _transform(self) -> None:
         rows, cols = self.shape
         nearest = np.empty((rows, cols), dtype=np.int16)
-        kernels.nearest_rows(self._obstacle, nearest, np.empty(cols, dtype=np.int32))
+        kernels.nearest_rows(self._obstacle, self._reach, nearest, np.empty(cols, dtype=np.int32))
         kernels.row_envelopes(nearest, 0, rows, self._reach, self.squared, self.site, *self._work[:3])
+        if self._half is not None:
+            self._nearest = nearest
 
     @property
     def obstacle(self) -> Bools:
@@ -91,29 +96,24 @@ class DistanceField:
         half of the map (the first wall in a wide unknown) costs as much as a new transform.
         Raises ValueError for cells that are not (N, 2) whole numbers or not in the rectangle.
         """
-        wanted, lost = self._cells(added), self._cells(removed)
-        if len(wanted):
-            lost = lost[~np.isin(_names(lost), _names(wanted))]
-        new = wanted[self._obstacle[wanted[:, 0], wanted[:, 1]] == 0]
-        lost = lost[self._obstacle[lost[:, 0], lost[:, 1]] == 1]
+        new, lost = self._sorted_out(_cells(added), _cells(removed))
         self._spans[:, 0], self._spans[:, 1] = self.shape[1], 0
         if len(new) + len(lost) == 0:
+            return self._spans
+        if self._half is not None:
+            kept = (self._obstacle, self._nearest, self.squared, self.site, self._spans)
+            clearance_reach.change_within(new, lost, self._half, *kept, *self._work[:3])
             return self._spans
         if self._columns is None:
             self._columns = np.zeros((self.shape[1], (self.shape[0] + 63) // 64), dtype=np.uint64)
             self._count = kernels.column_bits(self._obstacle, self._columns)
-        if self._half is not None:
-            kept = (self._obstacle, self._columns, self.squared, self.site, self._spans)
-            kernels.add_within(new, self._half, *kept)
-            kernels.remove_within(lost, np.empty((len(lost), 3), dtype=np.int32), self._half, *kept, *self._work)
-            return self._spans
         self._count += len(new) - len(lost)
         if self._count == len(new) or self._count == 0:
             self._start_anew(new, lost)
             return self._spans
         layers = (self._obstacle, self._columns, self.squared, self.site, self._spans)
-        kernels.add_obstacles(new, *layers)
-        kernels.remove_obstacles(lost, np.empty_like(lost), *layers, *self._work)
+        kernels.add_obstacles(_scattered(new), *layers)
+        kernels.remove_obstacles(_scattered(lost), np.empty_like(lost), *layers, *self._work)
         return self._spans
 
     def _start_anew(self, new: I32, lost: I32) -> None:
@@ -124,31 +124,33 @@ class DistanceField:
         self._transform()
         self._spans[:, 0], self._spans[:, 1] = 0, self.shape[1]
 
-    def _cells(self, cells: ArrayLike) -> I32:
-        """(N, 2) cells, each once, in scattered order: neighbours one after the other would take each other's land."""
-        given = np.asarray(cells)
-        if given.size == 0:
-            return np.zeros((0, 2), dtype=np.int32)
-        if given.ndim != 2 or given.shape[1] != 2 or not np.issubdtype(given.dtype, np.integer):
-            raise ValueError(f"cells are (N, 2) whole numbers, got {given.dtype} {given.shape}")
-        if given.min() < 0 or np.any(given.max(axis=0) >= self.shape):
+    def _sorted_out(self, added: I64, removed: I64) -> tuple[I32, I32]:
+        """(N, 2) cells that become obstacles, and that are none any more, each once."""
+        new = np.empty((len(added), 2), dtype=np.int32)
+        lost = np.empty((len(removed), 2), dtype=np.int32)
+        n_new, n_lost = kernels.sort_out(added, removed, self._obstacle, new, lost)
+        if n_new < 0:
             raise ValueError(f"a cell is outside of the field's {self.shape[0]} x {self.shape[1]} cells")
-        names = np.unique(_names(given.astype(np.int32)))
-        names = names[_scattered(len(names))]
-        return np.stack((names >> 16, names & 0xFFFF), axis=-1)
+        return new[:n_new], lost[:n_lost]
 
 
-def _names(cells: I32) -> I32:
-    """Row and column in one number."""
-    return cells[:, 0] << 16 | cells[:, 1]
+def _cells(cells: ArrayLike) -> I64:
+    """(N, 2) whole numbers."""
+    given = np.asarray(cells)
+    if given.size == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    if given.ndim != 2 or given.shape[1] != 2 or not np.issubdtype(given.dtype, np.integer):
+        raise ValueError(f"cells are (N, 2) whole numbers, got {given.dtype} {given.shape}")
+    return np.ascontiguousarray(given, dtype=np.int64)
 
 
-def _scattered(n: int) -> NDArray[np.int64]:
-    """The numbers below n, each far from the one before it."""
+def _scattered(cells: I32) -> I32:
+    """The cells, each far from the one before it: neighbours one after the other would take each other's land."""
+    n = len(cells)
     step = max(1, round(0.618 * n))
     while math.gcd(step, n) != 1:
         step += 1
-    return np.arange(n, dtype=np.int64) * step % n
+    return cells[np.arange(n, dtype=np.int64) * step % max(n, 1)]
 
 
 def clearance_layer(patch: GridPatch, *, occupied_percent: int = 65, unknown_is_obstacle: bool = False) -> F32:

@@ -10,9 +10,7 @@ lives on that: in each row the place where a new or lost obstacle's interval mus
 row, away from the obstacle, until its Voronoi region (which is convex) has ended. Work: the cells that change, a few
 steps for each row in which that region is alive.
 
-With a reach, distances beyond it are not kept: such cells have FAR and NO_SITE. Then what one obstacle rules lies in a
-disc, less what its neighbours rule: a new one is held against every cell there, and where a lost one ruled is filled
-anew. Work: the discs at most, whatever the size of the map.
+Distances up to a reach are kept up to date by `clearance_reach`.
 
     obstacle (R, C) uint8    columns (C, W) uint64, bit r of a column's W words: an obstacle in row r
     squared  (R, C) int32    FAR where there is no obstacle at all
@@ -28,15 +26,56 @@ from numba import njit
 
 FAR = 1 << 30  # squared distance where there is no obstacle at all
 NO_SITE = -1
-NO_ROW = -30_000  # in `nearest_row`: no obstacle in this column; its distance exceeds any there is
+NO_ROW = -30_000  # in `nearest_rows`: no obstacle in this column, or none within reach
 _NONE_BELOW = 90_000
+_LOST, _NEW = 2, 3  # in `sort_out`, while it is at work
 MAX_SIDE = 20_000  # squares of distances fit 32 bits, rows and columns 16
 UNLIMITED = 1 << 15  # a reach that no distance exceeds: its square is FAR
 
 
 @njit(cache=True, nogil=True)
-def nearest_rows(obstacle: Any, nearest: Any, below: Any) -> None:
-    """nearest: (R, C) int16, row of the nearest obstacle in each cell's column, or NO_ROW. below: (C,) int32, work."""
+def sort_out(added: Any, removed: Any, obstacle: Any, new: Any, lost: Any) -> Any:
+    """Write cells that become obstacles to new, that are none any more to lost, each once; how many of both.
+
+    added, removed: (N, 2) int64 cells; of both lists: added.  obstacle is as before when this is done.
+    Returns -1, -1 if a cell lies outside.
+    """
+    rows, cols = obstacle.shape
+    for cells in (added, removed):
+        for k in range(cells.shape[0]):
+            if not (0 <= cells[k, 0] < rows and 0 <= cells[k, 1] < cols):
+                return -1, -1
+    n_new, n_lost, n_left = 0, 0, 0
+    for k in range(removed.shape[0]):
+        r, c = removed[k, 0], removed[k, 1]
+        if obstacle[r, c] == 1:
+            obstacle[r, c] = _LOST
+            lost[n_lost, 0], lost[n_lost, 1] = r, c
+            n_lost += 1
+    for k in range(added.shape[0]):
+        r, c = added[k, 0], added[k, 1]
+        if obstacle[r, c] == 0:
+            obstacle[r, c] = _NEW
+            new[n_new, 0], new[n_new, 1] = r, c
+            n_new += 1
+        elif obstacle[r, c] == _LOST:
+            obstacle[r, c] = 1
+    for k in range(n_lost):
+        r, c = lost[k, 0], lost[k, 1]
+        if obstacle[r, c] == _LOST:
+            obstacle[r, c] = 1
+            lost[n_left, 0], lost[n_left, 1] = r, c
+            n_left += 1
+    for k in range(n_new):
+        obstacle[new[k, 0], new[k, 1]] = 0
+    return n_new, n_left
+
+
+@njit(cache=True, nogil=True)
+def nearest_rows(obstacle: Any, reach: int, nearest: Any, below: Any) -> None:
+    """nearest: (R, C) int16, row of the nearest obstacle in each cell's column, or NO_ROW if it is beyond reach.
+    below: (C,) int32, work."""
+    farthest = np.int32(min(reach, MAX_SIDE))
     rows, cols = obstacle.shape
     for c in range(cols):
         nearest[0, c] = np.int16(0) if obstacle[0, c] else np.int16(NO_ROW)
@@ -49,7 +88,9 @@ def nearest_rows(obstacle: Any, nearest: Any, below: Any) -> None:
             under = np.int32(r) if obstacle[r, c] else below[c]
             below[c] = under
             above = np.int32(nearest[r, c])
-            nearest[r, c] = np.int16(above if np.int32(r) - above <= under - np.int32(r) else under)
+            to_above, to_below = np.int32(np.int32(r) - above), np.int32(under - np.int32(r))
+            row = np.int16(above if to_above <= to_below else under)
+            nearest[r, c] = row if min(to_above, to_below) <= farthest else np.int16(NO_ROW)
 
 
 @njit(cache=True, nogil=True)
@@ -59,13 +100,12 @@ def row_envelopes(
     """squared, site of rows [row0, row1) from nearest_rows; apex, height, begins: (C + 1,) int32 work arrays."""
     cols = nearest.shape[1]
     bound = np.int32(min(reach * reach, FAR - 1))
-    no_column = min(reach, MAX_SIDE)
     for r in range(row0, row1):
         top = -1
         for c in range(cols):
-            g = np.int64(abs(r - np.int64(nearest[r, c])))
-            if g > no_column:
-                continue  # no obstacle in this column, or out of reach
+            if nearest[r, c] == NO_ROW:
+                continue
+            g = np.int64(r - np.int64(nearest[r, c]))
             top = push_parabola(c, g * g, top, 0, cols, apex, height, begins)
         if top < 0:
             for c in range(cols):
@@ -303,25 +343,22 @@ def add_obstacles(new: Any, obstacle: Any, columns: Any, squared: Any, site: Any
 
 @njit(cache=True, nogil=True)
 def refill_run(
-    r: Any, p: Any, q: Any, reach: Any, columns: Any, squared: Any, site: Any, apex: Any, height: Any, begins: Any,
-    rows: Any,
-) -> None:  # fmt: skip
-    """Cells [p, q) of row r have lost their obstacles: their neighbours' and those in columns between are left, as far
-    as they are within reach.
+    r: Any, p: Any, q: Any, columns: Any, squared: Any, site: Any, apex: Any, height: Any, begins: Any, rows: Any
+) -> None:
+    """Cells [p, q) of row r have lost their obstacles: their neighbours' and those in columns between are left.
 
     rows: (C + 1,) int32 work, the row of each apex.
     """
     total_rows, cols = site.shape
-    first_col: Any = max(0, p - reach)
-    last_col: Any = min(cols - 1, q - 1 + reach)
-    farthest = np.int64(min(reach * reach, FAR - 1))
-    bound = farthest
-    if p > 0 and site[r, p - 1] >= 0:
+    first_col: Any = 0
+    last_col: Any = cols - 1
+    bound: Any = np.int64(FAR - 1)
+    if p > 0:
         left = np.int64(site[r, p - 1])
         first_col = max(first_col, left & 0xFFFF)
         away = max(abs(p - (left & 0xFFFF)), abs(q - 1 - (left & 0xFFFF)))
         bound = min(bound, away * away + (r - (left >> 16)) * (r - (left >> 16)))
-    if q < cols and site[r, q] >= 0:
+    if q < cols:
         right = np.int64(site[r, q])
         last_col = min(last_col, right & 0xFFFF)
         away = max(abs(p - (right & 0xFFFF)), abs(q - 1 - (right & 0xFFFF)))
@@ -338,17 +375,13 @@ def refill_run(
         top = push_parabola(c, np.int64(r - row) * np.int64(r - row), top, p, q, apex, height, begins)
         if apex[top] == c:
             rows[top] = row
-    for c in range(p, q if top < 0 else p):
-        squared[r, c] = FAR
-        site[r, c] = NO_SITE
     for k in range(top + 1):
         stop = np.int64(begins[k + 1]) if k < top else q
         here, base = np.int64(apex[k]), np.int64(height[k])
         name = np.int32(np.int32(rows[k]) << 16 | np.int32(here))
         for c in range(np.int64(begins[k]), stop):
-            value = (c - here) * (c - here) + base
-            squared[r, c] = value if value <= farthest else FAR
-            site[r, c] = name if value <= farthest else np.int32(NO_SITE)
+            squared[r, c] = (c - here) * (c - here) + base
+            site[r, c] = name
 
 
 @njit(cache=True, nogil=True)
@@ -370,7 +403,7 @@ def release_row(
         first -= 1
     while stop < cols and not obstacle[site[r, stop] >> 16, site[r, stop] & 0xFFFF]:
         stop += 1
-    refill_run(r, first, stop, UNLIMITED, columns, squared, site, apex, height, begins, rows)
+    refill_run(r, first, stop, columns, squared, site, apex, height, begins, rows)
     note_span(spans, r, first, stop)
     return p
 
@@ -404,133 +437,3 @@ def remove_obstacles(
             )  # fmt: skip
             if guess < 0:
                 break
-
-
-@njit(cache=True, nogil=True)
-def half_widths(reach: int) -> Any:
-    """(reach + 1,) int32: how far a disc of that radius extends along a row that is so many rows from its centre."""
-    half = np.empty(reach + 1, np.int32)
-    width = reach
-    for away in range(reach + 1):
-        while width * width + away * away > reach * reach:
-            width -= 1
-        half[away] = width
-    return half
-
-
-@njit(cache=True, nogil=True)
-def beside(row: Any, a: Any, obstacle: Any) -> Any:
-    """Which cells around (row, a) are obstacles: bits 0 to 2 to the left, in the row before, its own and the one after;
-    bits 3 to 5 to the right."""
-    rows, cols = obstacle.shape
-    bits = 0
-    for way in range(2):
-        c = a + 2 * way - 1
-        if 0 <= c < cols:
-            for step in range(3):
-                r = row + step - 1
-                if 0 <= r < rows and obstacle[r, c]:
-                    bits |= 1 << (3 * way + step)
-    return bits
-
-
-@njit(cache=True, nogil=True)
-def span_ruled(down: Any, bits: Any, wide: Any) -> Any:
-    """(first, last) column, from its own, that an obstacle can rule `down` rows below it: within `wide` of it, and not
-    beyond the middle between it and those `beside` it."""
-    first, last = -wide, wide
-    if bits & 1:
-        first = max(first, -1 - down)
-    if bits & 2:
-        first = max(first, 0)
-    if bits & 4:
-        first = max(first, -1 + down)
-    if bits & 8:
-        last = min(last, 1 + down)
-    if bits & 16:
-        last = min(last, 0)
-    if bits & 32:
-        last = min(last, 1 - down)
-    return first, last
-
-
-@njit(cache=True, nogil=True)
-def add_within(new: Any, half: Any, obstacle: Any, columns: Any, squared: Any, site: Any, spans: Any) -> None:
-    """new: (N, 2) int32 cells, free before.  half: `half_widths` of the reach.
-
-    All of them are there before the first takes its cells, so none looks at what another of them rules.
-    """
-    total_rows, cols = site.shape
-    reach = half.size - 1
-    for k in range(new.shape[0]):
-        row, a = np.int64(new[k, 0]), np.int64(new[k, 1])
-        obstacle[row, a] = 1
-        columns[a, row >> 6] |= np.uint64(1) << np.uint64(row & 63)
-    for k in range(new.shape[0]):
-        row, a = np.int64(new[k, 0]), np.int64(new[k, 1])
-        name, order = np.int32(row << 16 | a), np.int32(a << 16 | row)
-        above, below = rows_ruled(columns, row, a, total_rows)
-        bits = beside(row, a, obstacle)
-        for r in range(max(above, row - reach), min(below, row + reach) + 1):
-            low, high = span_ruled(r - row, bits, np.int64(half[abs(r - row)]))
-            first: Any = max(a + low, 0)
-            stop: Any = min(a + high + 1, cols)
-            if first >= stop:
-                continue
-            h = np.int32((r - row) * (r - row))
-            distances, names = squared[r, first:stop], site[r, first:stop]
-            from_a, took = np.int32(first - a), np.int32(0)
-            for i in range(distances.size):
-                away = np.int32(from_a + np.int32(i))
-                value = np.int32(h + away * away)
-                was, its = distances[i], names[i]
-                its = np.int32(np.int32(its << np.int32(16)) | np.int32(its >> np.int32(16)))  # columns count first
-                nearer = (value < was) | ((value == was) & (order < its))
-                distances[i] = value if nearer else was
-                names[i] = name if nearer else names[i]
-                took += np.int32(nearer)
-            if took > 0:
-                note_span(spans, r, first, stop)
-
-
-@njit(cache=True, nogil=True)
-def remove_within(
-    lost: Any, ruled: Any, half: Any, obstacle: Any, columns: Any, squared: Any, site: Any, spans: Any, apex: Any,
-    height: Any, begins: Any, rows: Any,
-) -> None:  # fmt: skip
-    """lost: (N, 2) int32 cells with obstacles.  ruled: (N, 3) int32, work: rows, and what is beside each."""
-    total_rows, cols = site.shape
-    reach = half.size - 1
-    for k in range(lost.shape[0]):
-        row, a = np.int64(lost[k, 0]), np.int64(lost[k, 1])
-        above, below = rows_ruled(columns, row, a, total_rows)
-        ruled[k, 0], ruled[k, 1] = max(above, row - reach), min(below, row + reach)
-        ruled[k, 2] = beside(row, a, obstacle)
-    for k in range(lost.shape[0]):
-        row, a = np.int64(lost[k, 0]), np.int64(lost[k, 1])
-        obstacle[row, a] = 0
-        columns[a, row >> 6] &= ~(np.uint64(1) << np.uint64(row & 63))
-    for k in range(lost.shape[0]):
-        row, a = np.int64(lost[k, 0]), np.int64(lost[k, 1])
-        name = np.int32(row << 16 | a)
-        for r in range(np.int64(ruled[k, 0]), np.int64(ruled[k, 1]) + 1):
-            low, high = span_ruled(r - row, np.int64(ruled[k, 2]), np.int64(half[abs(r - row)]))
-            c: Any = max(a + low, 0)
-            stop: Any = min(a + high + 1, cols)
-            while c < stop and site[r, c] != name:  # what it rules of a row is one run
-                c += 1
-            if c >= stop:
-                continue
-            first = c
-            while first > 0 and is_orphan(site[r, first - 1], obstacle):
-                first -= 1
-            while c < cols and is_orphan(site[r, c], obstacle):
-                c += 1
-            refill_run(r, first, c, reach, columns, squared, site, apex, height, begins, rows)
-            note_span(spans, r, first, c)
-
-
-@njit(cache=True, nogil=True)
-def is_orphan(name: Any, obstacle: Any) -> bool:
-    """Whether the obstacle that a cell names is none any more."""
-    return bool(name >= 0 and obstacle[name >> 16, name & 0xFFFF] == 0)

@@ -131,6 +131,47 @@ def test_a_field_with_a_reach_is_the_whole_one_cut_off(mask: Mask, seed: int, ta
         assert not np.any((before != field.site) & ~inside)
 
 
+def scanned_room(rng: np.random.Generator) -> Mask:
+    """A room as beams leave it in a grid: walls a cell or two thick, met here and there, with stray cells before them;
+    one wall without a gap, and one that slants."""
+    mask = np.zeros((180, 220), dtype=np.bool_)
+    for along in range(20, 200):
+        for row in (30, 140):
+            if rng.random() < 0.4:
+                mask[row + rng.integers(-1, 2), along] = True
+    for row in range(30, 140):
+        if rng.random() < 0.3:
+            mask[row, 20 + rng.integers(-1, 2)] = True
+        mask[row, 170 - row // 2] |= rng.random() < 0.5
+    mask[30:140, 199] = rng.random() < 0.8
+    mask[tuple(rng.integers((0, 0), mask.shape, (10, 2)).T)] = True
+    return mask
+
+
+@pytest.mark.parametrize("reach", [1, 5, 17, 40])
+def test_scans_of_a_room_one_after_the_other_agree_with_scipy(reach: int) -> None:
+    """Each scan has some cells of the walls elsewhere; kept up to date by them, cut off at the reach."""
+    rng = np.random.default_rng(7)
+    field = DistanceField(np.zeros((180, 220), dtype=np.bool_), reach_cells=reach)
+    for ends in (120, 220, 60, 220, 180, 10):
+        mask, seen = scanned_room(rng), np.zeros(field.shape, dtype=np.bool_)
+        seen[:, :ends] = True  # the rest stays as it was
+        field.update(np.argwhere(mask & ~field.obstacle & seen), np.argwhere(~mask & field.obstacle & seen))
+        squared = np.rint(distance_transform_edt(~field.obstacle) ** 2)
+        assert np.array_equal(field.squared, np.where(squared > reach * reach, FAR, squared))
+
+
+def test_a_cell_that_comes_and_goes_at_once_stays() -> None:
+    """In both lists, twice, of what was there and what was not: an obstacle in the end, and the others are left."""
+    for reach in (None, 3):
+        field = DistanceField(np.eye(5, 6, dtype=np.bool_), reach_cells=reach)
+        field.update([(1, 1), (0, 3), (0, 3)], [(1, 1), (1, 1), (0, 3), (2, 2), (4, 0)])
+        mask = np.eye(5, 6, dtype=np.bool_)
+        mask[2, 2], mask[0, 3] = False, True
+        assert np.array_equal(field.obstacle, mask)
+        assert np.array_equal(field.site, DistanceField(mask, reach_cells=reach).site)
+
+
 def test_a_reach_below_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="reach"):
         DistanceField(np.eye(3, dtype=np.bool_), reach_cells=-1)
