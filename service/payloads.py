@@ -215,7 +215,7 @@ class Encoder:
         snap, stamp_ns = out.snapshot, out.snapshot.stamp_ns + offset_ns
         form = self._rect_forms.get(out.name)
         if form is None or not form.is_of(snap.base_from_sensor, snap.sources, snap.x_edges_m, snap.y_edges_m):
-            rows, columns = snap.state.shape
+            rows, columns = snap.shape
             heads, edges = _rect_heads(snap.x_edges_m, snap.y_edges_m), (snap.x_edges_m, snap.y_edges_m)
             begin = _document_begin(
                 "rect", out.name, self._frames.base, snap.base_from_sensor, rows=rows, columns=columns
@@ -712,9 +712,10 @@ def _polar_document(snap: PolarSnapshot, form: SectorForm, ground: SectorGround 
 
 
 def _rect_document(snap: RectSnapshot, form: SectorForm, stamp_ns: int) -> bytes:
-    x, y = snap.x_m.ravel(), snap.y_m.ravel()
-    columns = np.array((x, y, np.hypot(x, y), _seconds(snap.age_ns.ravel())))
-    return form.document(stamp_ns, snap.state.ravel(), columns, snap.source.ravel())
+    known = snap.squares
+    x, y = known.x_m.ravel(), known.y_m.ravel()
+    columns = np.array((x, y, np.hypot(x, y), _seconds(known.age_ns.ravel())))
+    return form.document(stamp_ns, known.state.ravel(), columns, known.source.ravel())
 
 
 def _seconds(age_ns: I64) -> F64:

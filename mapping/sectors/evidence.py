@@ -12,8 +12,9 @@ The rules, each there so that no loss of data makes a sector freer:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,18 +48,71 @@ class Finding:
     blind: Bool
 
 
+def blind_finding(blind: Bool) -> Finding:
+    """Nothing but where a reading was meant to see and could not, (N,)."""
+    count = len(blind)
+    nowhere = np.full(count, np.nan)
+    return Finding(np.full(count, np.inf), nowhere, nowhere, np.zeros(count), blind)
+
+
+class Later:
+    """A finding that is worked out when somebody asks for it: most maps are read by nobody most of the time.
+
+    make: from values that stay as they are.  obstacles: its obstacle_m, u and v, if they are known already.
+    """
+
+    __slots__ = ("_found", "_make", "_obstacles")
+
+    def __init__(self, make: Callable[[], Finding], obstacles: tuple[F64, F64, F64] | None = None) -> None:
+        self._make: Callable[[], Finding] | None = make
+        self._found: Finding | None = None
+        self._obstacles = obstacles
+
+    def found(self) -> Finding:
+        """All of it. Two threads that ask at once make the same."""
+        make, found = self._make, self._found
+        if found is None:
+            assert make is not None
+            found = self._found = make()
+            self._make = None  # what it was made of is not kept
+        return found
+
+    def obstacles(self) -> tuple[F64, F64, F64]:
+        """Its obstacle_m, u and v."""
+        if self._obstacles is None:
+            found = self.found()
+            self._obstacles = (found.obstacle_m, found.u, found.v)
+        return self._obstacles
+
+
+@dataclass(slots=True)
+class _Held:
+    """(N,) obstacles of earlier findings in whose direction nobody has looked since. Only dead is ever replaced."""
+
+    obstacle_m: F64
+    u: F64
+    v: F64
+    stamp_ns: I64
+    dead: Bool
+
+
 @dataclass(slots=True)
 class _Channel:
     source: int
     stamp_ns: int
     dead: bool
-    finding: Finding
-    held_m: F64
-    held_u: F64
-    held_v: F64
-    held_stamp_ns: I64
-    held_dead: Bool
-    holds: bool  # held_* are its own, not those that stand for nothing held
+    finding: Finding | Later
+    held: _Held | None = None
+
+
+class _Row(NamedTuple):
+    """What a channel says as of one instant."""
+
+    source: int
+    stamp_ns: int
+    fresh: bool
+    finding: Finding | Later
+    held: tuple[F64, F64, F64, I64, Bool] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,31 +136,30 @@ class _Table:
         self._obstacle, self._u, self._v, self._free = (np.zeros(shape) for _ in range(4))
         self._blind, self._fresh = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
         self._stamp, self._source = np.zeros(shape, dtype=np.int64), np.zeros(shape[0], dtype=np.int64)
-        self._findings: list[Finding | None] = [None] * channels
+        self._findings: list[Finding | Later | None] = [None] * channels
         self._stamps = [-1] * channels
         self._freshness = [False] * channels
 
     def columns(
-        self, channels: list[_Channel], now_ns: int, limits: tuple[int, ...]
+        self, channels: Sequence[_Row], now_ns: int, limits: tuple[int, ...]
     ) -> tuple[F64, F64, F64, F64, Bool, I64, Bool, I64]:
         """Obstacle, u, v, free, blind, stamp, fresh (F, N) and source (F,) of as many channels as it was made for."""
         rows = len(channels)
         for row, c in enumerate(channels):
-            found = c.finding
-            if self._findings[row] is not found:
-                self._findings[row] = found
+            if self._findings[row] is not c.finding:
+                self._findings[row] = c.finding
+                found = c.finding.found() if isinstance(c.finding, Later) else c.finding
                 self._obstacle[row], self._u[row], self._v[row] = found.obstacle_m, found.u, found.v
                 self._free[row], self._blind[row], self._source[row] = found.free_m, found.blind, c.source
             if self._stamps[row] != c.stamp_ns:
                 self._stamp[row] = self._stamps[row] = c.stamp_ns
-            if self._freshness[row] == c.dead:
-                self._fresh[row] = self._freshness[row] = not c.dead
+            if self._freshness[row] != c.fresh:
+                self._fresh[row] = self._freshness[row] = c.fresh
         for c in channels:
-            if c.holds and np.isfinite(c.held_m).any():
-                self._obstacle[rows], self._u[rows], self._v[rows] = c.held_m, c.held_u, c.held_v
+            if c.held is not None and np.isfinite(c.held[0]).any():
+                self._obstacle[rows], self._u[rows], self._v[rows], self._stamp[rows], dead = c.held
                 self._free[rows], self._blind[rows], self._source[rows] = 0.0, False, c.source
-                self._stamp[rows] = c.held_stamp_ns
-                self._fresh[rows] = ~c.held_dead & (now_ns - c.held_stamp_ns <= limits[c.source])
+                self._fresh[rows] = ~dead & (now_ns - c.held[3] <= limits[c.source])
                 rows += 1
         return (
             self._obstacle[:rows], self._u[:rows], self._v[:rows], self._free[:rows], self._blind[:rows],
@@ -135,14 +188,8 @@ class Evidence:
         self._table = _Table(0, count)
         self._touched: dict[tuple[int, int], Finding] = {}  # of switches: what each would say if it were tripped
         self._heard = [not wait_for_sources] * len(sources)
-        self._nothing_held: tuple[F64, F64, F64, I64, Bool] = (
-            np.full(count, np.inf),
-            np.full(count, np.nan),
-            np.full(count, np.nan),
-            np.zeros(count, dtype=np.int64),
-            np.zeros(count, dtype=bool),
-        )
-        for each in self._nothing_held:
+        self._nothing_m, self._nowhere = np.full(count, np.inf), np.full(count, np.nan)
+        for each in (self._nothing_m, self._nowhere):
             each.setflags(write=False)
 
     def index(self, source: str) -> int:
@@ -152,7 +199,13 @@ class Evidence:
         except ValueError:
             raise ValueError(f"{source!r} does not feed this sector map, only {', '.join(self.sources)}") from None
 
-    def revise(self, source: str, channel: int, finding: Finding, *, stamp_ns: int, looked: Looked | None) -> None:
+    def has_heard(self, source: str, channel: int) -> bool:
+        """Whether a channel has said anything yet. ValueError for an unknown source."""
+        return (self.index(source), channel) in self._channels
+
+    def revise(
+        self, source: str, channel: int, finding: Finding | Later, *, stamp_ns: int, looked: Looked | None
+    ) -> None:
         """Replace a channel's finding by a newer one. Older ones than the last are passed over.
 
         looked: None if the reading looked everywhere its predecessor did.
@@ -162,7 +215,7 @@ class Evidence:
         old = self._channels.get((at, channel))
         if old is not None and not old.dead and stamp_ns < old.stamp_ns:
             return
-        new = _Channel(at, stamp_ns, False, finding, *self._nothing_held, holds=False)
+        new = _Channel(at, stamp_ns, False, finding)
         if old is not None and looked is not None:
             _hold(new, old, looked)
         self._channels[at, channel] = new
@@ -170,18 +223,11 @@ class Evidence:
             self._channels = dict(sorted(self._channels.items()))
             self._table = _Table(len(self._channels), self._count)
 
-    def nothing_heard(self, source: str, channel: int, finding: Finding, *, stamp_ns: int) -> None:
-        """An invalid reading: what the channel said before stays and ages; a first one only says where it is blind."""
-        at = self.index(source)
-        if (at, channel) not in self._channels:
-            self.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
-
     def feel(self, source: str, channel: int, touched: Finding, *, tripped: bool | None, stamp_ns: int) -> None:
         """Take a switch. touched: what it says when it is tripped; else it says nothing, and None that it is stale."""
         at = self.index(source)
-        nothing_m, nowhere, *_ = self._nothing_held
         none = np.zeros(self._count)
-        clear = Finding(nothing_m, nowhere, nowhere, none, none.astype(bool))
+        clear = Finding(self._nothing_m, self._nowhere, self._nowhere, none, none.astype(bool))
         self._touched[at, channel] = touched
         self.revise(source, channel, clear if tripped is False else touched, stamp_ns=stamp_ns, looked=None)
         if tripped is None:
@@ -196,58 +242,77 @@ class Evidence:
         for channel in self._channels.values():
             if channel.source == at:
                 channel.dead = True
-                if channel.holds:
-                    channel.held_dead[:] = True
+                if channel.held is not None:
+                    channel.held.dead = np.ones(self._count, dtype=bool)
 
     def verdict(self, now_ns: int) -> Verdict:
         """What is known of each sector at an instant."""
-        count = self._count
-        if not self._channels:
-            nan = np.full(count, np.nan)
-            return Verdict(
-                np.full(count, SectorState.UNKNOWN, dtype=np.int8),
-                nan,
-                nan.copy(),
-                nan.copy(),
-                np.full(count, -1, dtype=np.int64),
-                np.full(count, -1, dtype=np.int16),
-            )
-        for channel in self._channels.values():
-            # A stamp far ahead is a broken clock: it must not keep an old reading young.
-            if abs(now_ns - channel.stamp_ns) > self._limits[channel.source]:
-                channel.dead = True
-        return self._judge(now_ns)
+        return _judged(self._rows(now_ns), self._table, self._count, self._limits, all(self._heard), now_ns)
 
-    def _judge(self, now_ns: int) -> Verdict:
-        columns = self._table.columns(list(self._channels.values()), now_ns, self._limits)
-        return Verdict(*kernels.judge(*columns, all(self._heard), now_ns, _STATES))
+    def verdict_later(self, now_ns: int) -> Callable[[], Verdict]:
+        """The same, worked out when it is called, by whichever thread; what comes until then does not change it."""
+        rows, all_heard, count, limits = self._rows(now_ns), all(self._heard), self._count, self._limits
+        return lambda: _judged(rows, _Table(len(rows), count), count, limits, all_heard, now_ns)
+
+    def _rows(self, now_ns: int) -> list[_Row]:
+        """All channels as they stand; those that have become too old stay so."""
+        rows = []
+        for c in self._channels.values():
+            # A stamp far ahead is a broken clock: it must not keep an old reading young.
+            if abs(now_ns - c.stamp_ns) > self._limits[c.source]:
+                c.dead = True
+            held = c.held
+            kept = None if held is None else (held.obstacle_m, held.u, held.v, held.stamp_ns, held.dead)
+            rows.append(_Row(c.source, c.stamp_ns, not c.dead, c.finding, kept))
+        return rows
+
+
+def _judged(
+    rows: Sequence[_Row], table: _Table, count: int, limits: tuple[int, ...], all_heard: bool, now_ns: int
+) -> Verdict:
+    if rows:
+        return Verdict(*kernels.judge(*table.columns(rows, now_ns, limits), all_heard, now_ns, _STATES))
+    nan, none = np.full(count, np.nan), np.full(count, -1, dtype=np.int64)
+    state = np.full(count, SectorState.UNKNOWN, dtype=np.int8)
+    return Verdict(state, nan, nan.copy(), nan.copy(), none, none.astype(np.int16))
 
 
 def _hold(new: _Channel, old: _Channel, looked: Looked) -> None:
     """Of what was held before and of the last finding: the nearest obstacle nobody has looked at since."""
-    if old.holds:
-        stays = _unseen(new, old.held_m, old.held_u, old.held_v, looked)
+    ours_m = _obstacles(new.finding)[0]
+    if old.held is not None:
+        was = old.held
+        stays = _unseen(ours_m, ours_m, was.obstacle_m, was.u, was.v, looked)
         if len(stays):
-            _hold_also(new, stays, old.held_m, old.held_u, old.held_v)
-            new.held_stamp_ns[stays], new.held_dead[stays] = old.held_stamp_ns[stays], old.held_dead[stays]
-    found = old.finding
-    stays = _unseen(new, found.obstacle_m, found.u, found.v, looked)
+            held = new.held = _nothing_held(len(ours_m))
+            _take(held, stays, was.obstacle_m, was.u, was.v)
+            held.stamp_ns[stays], held.dead[stays] = was.stamp_ns[stays], was.dead[stays]
+    obstacle_m, u, v = _obstacles(old.finding)
+    stays = _unseen(ours_m, ours_m if new.held is None else new.held.obstacle_m, obstacle_m, u, v, looked)
     if len(stays):
-        _hold_also(new, stays, found.obstacle_m, found.u, found.v)
-        new.held_stamp_ns[stays], new.held_dead[stays] = old.stamp_ns, old.dead
+        held = new.held = new.held or _nothing_held(len(ours_m))
+        _take(held, stays, obstacle_m, u, v)
+        held.stamp_ns[stays], held.dead[stays] = old.stamp_ns, old.dead
 
 
-def _unseen(new: _Channel, obstacle_m: F64, u: F64, v: F64, looked: Looked) -> I64:
+def _obstacles(finding: Finding | Later) -> tuple[F64, F64, F64]:
+    return finding.obstacles() if isinstance(finding, Later) else (finding.obstacle_m, finding.u, finding.v)
+
+
+def _unseen(ours_m: F64, held_m: F64, obstacle_m: F64, u: F64, v: F64, looked: Looked) -> I64:
     """Sectors whose obstacle is nearer than all the new reading and what is held already say, and not looked at."""
-    ours_m = new.finding.obstacle_m
-    nearer: I64 = kernels.nearer_than_both(obstacle_m, ours_m, new.held_m if new.holds else ours_m)
+    nearer: I64 = kernels.nearer_than_both(obstacle_m, ours_m, held_m)
     if len(nearer) == 0:
         return nearer
     return nearer[~looked(obstacle_m[nearer], u[nearer], v[nearer])]
 
 
-def _hold_also(new: _Channel, stays: I64, obstacle_m: F64, u: F64, v: F64) -> None:
-    if not new.holds:  # until now it has what stands for nothing held
-        new.held_m, new.held_u, new.held_v = new.held_m.copy(), new.held_u.copy(), new.held_v.copy()
-        new.held_stamp_ns, new.held_dead, new.holds = new.held_stamp_ns.copy(), new.held_dead.copy(), True
-    new.held_m[stays], new.held_u[stays], new.held_v[stays] = obstacle_m[stays], u[stays], v[stays]
+def _nothing_held(count: int) -> _Held:
+    nowhere = np.full(count, np.nan)
+    return _Held(
+        np.full(count, np.inf), nowhere, nowhere.copy(), np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool)
+    )
+
+
+def _take(held: _Held, stays: I64, obstacle_m: F64, u: F64, v: F64) -> None:
+    held.obstacle_m[stays], held.u[stays], held.v[stays] = obstacle_m[stays], u[stays], v[stays]

@@ -167,6 +167,11 @@ class FanReader:
         self._last = None
 
 
+def is_nothing(range_m: float) -> bool:
+    """Whether a sonar's range is invalid; infinite ones are not."""
+    return math.isnan(range_m) or (math.isfinite(range_m) and range_m < 0.0)
+
+
 def see_cone(
     range_m: float,
     *,

@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapping.frames import IDENTITY, Pose2
 from mapping.kernels import sectors as kernels
-from mapping.sectors.evidence import Evidence, Finding
+from mapping.sectors.evidence import Evidence, Finding, blind_finding
 from mapping.sectors.footprint import Outline, checked_polygon
 from mapping.sectors.inputs import (
     FanReader,
     cones_remembered,
+    is_nothing,
     see_cone,
     touched_line,
 )
@@ -136,16 +137,14 @@ class PolarSectors:
         cone_rad: full opening angle.  An echo counts for every sector its arc passes, at the arc's nearest point
         there and the bearing of its point nearest to the axis.  Raises ValueError for an unknown source.
         """
-        self._evidence.index(source)
-        pose = self._virtual_from_base @ base_from_transducer
-        count = len(self.edges_rad) - 1
-        if math.isnan(range_m) or (math.isfinite(range_m) and range_m < 0.0):
-            nowhere = np.full(count, np.nan)
-            blind = self._frame.covered_by_cone(cone_rad, range_max_m, pose)
-            finding = Finding(np.full(count, np.inf), nowhere, nowhere, np.zeros(count), blind)
-            self._evidence.nothing_heard(source, channel, finding, stamp_ns=stamp_ns)
-            return
-        finding = self._heard(pose, cone_rad, range_m, range_min_m, range_max_m)
+        if is_nothing(range_m):  # what it said before stays and ages; a first one only says where it is blind
+            if self._evidence.has_heard(source, channel):
+                return
+            pose = self._virtual_from_base @ base_from_transducer
+            finding = blind_finding(self._frame.covered_by_cone(cone_rad, range_max_m, pose))
+        else:
+            pose = self._virtual_from_base @ base_from_transducer
+            finding = self._heard(pose, cone_rad, range_m, range_min_m, range_max_m)
         self._evidence.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
 
     def _find_in_cone(

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.frames import IDENTITY, Pose2
 from mapping.kernels import sectors as kernels
-from mapping.sectors.evidence import Evidence, Finding
+from mapping.sectors.evidence import Evidence, Finding, Later, Verdict, blind_finding
 from mapping.sectors.footprint import Outline, checked_polygon
 from mapping.sectors.inputs import (
     FanReader,
     cones_remembered,
+    is_nothing,
     see_cone,
     touched_line,
 )
 from mapping.sectors.sight import Sight, arc_of_cone
-from mapping.sectors.snapshot import RectSnapshot
+from mapping.sectors.snapshot import RectSnapshot, Squares
 
 F64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -29,6 +31,9 @@ _SECTORS_MAX = 250_000
 
 class RectSectors:
     """The newest word of every source on each square around a virtual sensor.
+
+    What readings say of the squares is worked out when a snapshot is looked into: most of the time nobody does. Which
+    obstacles a sweep leaves unseen, and for that what it met, is found with every sweep.
 
     size_m: extent along x and y, centred on the virtual sensor, rounded up to whole sectors.  sector_m: edge of one.
     A sector is free if all of its area outside the vehicle's outline was seen free; one that lies wholly under the
@@ -87,11 +92,11 @@ class RectSectors:
         fan = self._fans.read(source, stamp_ns, bearing_rad, range_m, base_from_sensor, range_max_m, spacing_rad)
         sight, points = fan.seen_from(self._virtual_from_base @ base_from_sensor, range_min_m)
         nearest_m, x, y = self._raster.nearest(points)
-        finding = Finding(nearest_m, x, y, self._raster.free(sight), np.zeros(len(x), dtype=bool))
+        finding = partial(_seen, self._raster, sight, nearest_m, x, y)
         self._evidence.revise(
             source,
             _BEAMS,
-            finding,
+            Later(finding, (nearest_m, x, y)),
             stamp_ns=stamp_ns,
             looked=lambda _, x_m, y_m: sight.looked_at(np.stack((x_m, y_m), axis=-1)),
         )
@@ -109,17 +114,20 @@ class RectSectors:
         stamp_ns: int,
     ) -> None:
         """Take one sonar's range; as PolarSectors.update_cone. An echo counts in every square its arc passes."""
-        self._evidence.index(source)
+        if is_nothing(range_m):  # what it said before stays and ages; a first one only says where it is blind
+            if self._evidence.has_heard(source, channel):
+                return
+            make = partial(self._find_blind, base_from_transducer, cone_rad, range_max_m)
+        else:
+            make = partial(self._find_heard, base_from_transducer, cone_rad, range_m, range_min_m, range_max_m)
+        self._evidence.revise(source, channel, Later(make), stamp_ns=stamp_ns, looked=None)
+
+    def _find_blind(self, base_from_transducer: Pose2, cone_rad: float, range_max_m: float) -> Finding:
         pose = self._virtual_from_base @ base_from_transducer
-        count = self._shape[0] * self._shape[1]
-        if math.isnan(range_m) or (math.isfinite(range_m) and range_m < 0.0):
-            nowhere = np.full(count, np.nan)
-            blind = self._raster.covered_by_cone(cone_rad, range_max_m, pose)
-            finding = Finding(np.full(count, np.inf), nowhere, nowhere, np.zeros(count), blind)
-            self._evidence.nothing_heard(source, channel, finding, stamp_ns=stamp_ns)
-            return
-        finding = self._heard(pose, cone_rad, range_m, range_min_m, range_max_m)
-        self._evidence.revise(source, channel, finding, stamp_ns=stamp_ns, looked=None)
+        return blind_finding(self._raster.covered_by_cone(cone_rad, range_max_m, pose))
+
+    def _find_heard(self, base_from_transducer: Pose2, *heard: float) -> Finding:
+        return self._heard(self._virtual_from_base @ base_from_transducer, *heard)
 
     def _find_in_cone(
         self, pose: Pose2, cone_rad: float, range_m: float, range_min_m: float, range_max_m: float
@@ -158,20 +166,30 @@ class RectSectors:
         self._fans.forget(source)
 
     def snapshot(self, now_ns: int) -> RectSnapshot:
-        """What is known at an instant, immutable."""
-        known = self._evidence.verdict(now_ns)
+        """What is known at an instant, immutable; of squares worked out when it is first asked for."""
         return RectSnapshot(
-            stamp_ns=now_ns,
-            base_from_sensor=self.base_from_sensor,
-            x_edges_m=self.x_edges_m,
-            y_edges_m=self.y_edges_m,
-            state=known.state.reshape(self._shape),
-            x_m=known.u.reshape(self._shape),
-            y_m=known.v.reshape(self._shape),
-            age_ns=known.age_ns.reshape(self._shape),
-            source=known.source.reshape(self._shape),
-            sources=self._evidence.sources,
+            now_ns,
+            self.base_from_sensor,
+            self.x_edges_m,
+            self.y_edges_m,
+            self._evidence.sources,
+            partial(_squares_of, self._evidence.verdict_later(now_ns), self._shape),
         )
+
+
+def _seen(raster: _Raster, sight: Sight, nearest_m: F64, x: F64, y: F64) -> Finding:
+    return Finding(nearest_m, x, y, raster.free(sight), np.zeros(len(x), dtype=bool))
+
+
+def _squares_of(verdict: Callable[[], Verdict], shape: tuple[int, int]) -> Squares:
+    known = verdict()
+    return Squares(
+        known.state.reshape(shape),
+        known.u.reshape(shape),
+        known.v.reshape(shape),
+        known.age_ns.reshape(shape),
+        known.source.reshape(shape),
+    )
 
 
 class _Raster:

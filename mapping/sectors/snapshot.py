@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -51,20 +52,72 @@ class PolarSnapshot:
 
 
 @dataclass(frozen=True, slots=True)
-class RectSnapshot:
-    """A rectangular sector map (S36): R x C sectors, row along y, column along x, both ascending.
+class Squares:
+    """(R, C) arrays of a RectSnapshot."""
 
-    x_edges_m: (C + 1,), y_edges_m: (R + 1,), virtual sensor frame.  state, x_m, y_m, age_ns, source: (R, C);
-    x_m, y_m: the obstacle nearest to the virtual sensor's origin in that sector, NaN if none.
-    """
-
-    stamp_ns: int
-    base_from_sensor: Pose2
-    x_edges_m: F64
-    y_edges_m: F64
     state: I8
     x_m: F64
     y_m: F64
     age_ns: I64
     source: I16
-    sources: tuple[str, ...]
+
+
+class RectSnapshot:
+    """A rectangular sector map (S36): R x C sectors, row along y, column along x, both ascending.
+
+    x_edges_m: (C + 1,), y_edges_m: (R + 1,), virtual sensor frame.  state, x_m, y_m, age_ns, source: (R, C);
+    x_m, y_m: the obstacle nearest to the virtual sensor's origin in that sector, NaN if none. They are worked out when
+    they are first asked for, by any thread, and are as of stamp_ns all the same.
+    """
+
+    __slots__ = ("_make", "_squares", "base_from_sensor", "sources", "stamp_ns", "x_edges_m", "y_edges_m")
+
+    def __init__(
+        self,
+        stamp_ns: int,
+        base_from_sensor: Pose2,
+        x_edges_m: F64,
+        y_edges_m: F64,
+        sources: tuple[str, ...],
+        make: Callable[[], Squares],
+    ) -> None:
+        """make: from values that stay as they are."""
+        self.stamp_ns, self.base_from_sensor, self.sources = stamp_ns, base_from_sensor, sources
+        self.x_edges_m, self.y_edges_m = x_edges_m, y_edges_m
+        self._make: Callable[[], Squares] | None = make
+        self._squares: Squares | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """R and C, without working anything out."""
+        return len(self.y_edges_m) - 1, len(self.x_edges_m) - 1
+
+    @property
+    def squares(self) -> Squares:
+        """All that is known. Two threads that ask at once make the same."""
+        make, squares = self._make, self._squares
+        if squares is None:
+            assert make is not None
+            squares = self._squares = make()
+            self._make = None  # what it was made of is not kept
+        return squares
+
+    @property
+    def state(self) -> I8:
+        return self.squares.state
+
+    @property
+    def x_m(self) -> F64:
+        return self.squares.x_m
+
+    @property
+    def y_m(self) -> F64:
+        return self.squares.y_m
+
+    @property
+    def age_ns(self) -> I64:
+        return self.squares.age_ns
+
+    @property
+    def source(self) -> I16:
+        return self.squares.source

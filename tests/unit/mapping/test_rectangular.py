@@ -159,6 +159,62 @@ def test_an_obstacle_stays_where_the_next_scan_is_blind() -> None:
     assert sectors.snapshot(2).state[at] == FREE
 
 
+@given(
+    st.lists(
+        st.one_of(
+            st.tuples(st.just("sweep"), st.integers(0, 719), st.integers(0, 300), st.floats(0.2, 3.0)),
+            st.tuples(st.just("cone"), st.integers(0, 2), st.just(0), st.sampled_from([0.4, 1.0, math.inf, math.nan])),
+            st.tuples(st.just("lost"), st.sampled_from([0, 1]), st.just(0), st.just(0.0)),
+        ),
+        min_size=1,
+        max_size=12,
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_a_snapshot_looked_into_later_says_what_was_known_then(steps: list[tuple[str, int, int, float]]) -> None:
+    at_once, later = (RectSectors(sources=("laser", "sonar"), stale_after_ns=300, footprint=BODY) for _ in range(2))
+    kept: list[tuple[RectSnapshot, RectSnapshot]] = []
+    for number, (kind, first, count, value) in enumerate(steps):
+        stamp_ns = 100 * number
+        for sectors in (at_once, later):
+            if kind == "sweep":  # a wall all around, and some beams that saw nothing or are lost
+                ranges = np.full(720, value)
+                ranges[first : first + count] = np.nan if count % 2 else np.inf
+                sweep(sectors, ranges, stamp_ns=stamp_ns)
+            elif kind == "cone":
+                sectors.update_cone(
+                    "sonar", first, base_from_transducer=Pose2(0.0, 0.0, first - 1.0), cone_rad=1.0, range_m=value,
+                    range_min_m=0.2, range_max_m=2.0, stamp_ns=stamp_ns,
+                )  # fmt: skip
+            else:
+                sectors.lost(("laser", "sonar")[first])
+        now, then = at_once.snapshot(stamp_ns), later.snapshot(stamp_ns)
+        assert now.state.shape == then.shape
+        kept.append((now, then))
+    for now, then in kept:
+        for name in ("state", "x_m", "y_m", "age_ns", "source"):
+            np.testing.assert_array_equal(getattr(then, name), getattr(now, name), name)
+
+
+def test_nothing_is_worked_out_for_a_map_that_nobody_looks_into(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Sight] = []
+    free = _Raster.free
+
+    def counted(raster: _Raster, sight: Sight) -> F64:
+        asked.append(sight)
+        return free(raster, sight)
+
+    monkeypatch.setattr(_Raster, "free", counted)
+    sectors = RectSectors(sources=("laser",))
+    for number in range(5):
+        sweep(sectors, np.full(720, 1.0), stamp_ns=number)
+        snapshot = sectors.snapshot(number)
+    assert not asked
+    assert snapshot.state[cell(snapshot, 0.5, 0.1)] == FREE
+    assert snapshot.state is snapshot.state
+    assert len(asked) == 1
+
+
 @pytest.mark.parametrize(("size", "edge"), [((0.0, 1.0), 0.1), ((1.0, 1.0), 0.0), ((1e5, 1e5), 0.1)])
 def test_impossible_rasters_are_refused(size: tuple[float, float], edge: float) -> None:
     with pytest.raises(ValueError):

@@ -20,7 +20,7 @@ from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from mapping.sectors.polar import PolarSectors
 from mapping.sectors.rectangular import RectSectors
-from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot, SectorState
+from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot, SectorState, Squares
 from service import cdr, topics
 from service.outputs import (
     GridOut,
@@ -222,12 +222,8 @@ def test_rect_document_goes_row_by_row() -> None:
         Pose2(),
         np.array([0.0, 1.0, 2.0, 3.0]),
         np.array([-1.0, 0.0, 1.0]),
-        state,
-        nearest,
-        nearest,
-        np.full((2, 3), 10),
-        np.zeros((2, 3), np.int16),
         ("front",),
+        lambda: Squares(state, nearest, nearest, np.full((2, 3), 10), np.zeros((2, 3), np.int16)),
     )
     (message,) = Encoder().encode(RectOut("around", snapshot), OFFSET)
     document = json.loads(message.payload)

@@ -17,7 +17,7 @@ from jsonschema import Draft202012Validator, ValidationError
 
 from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
-from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot
+from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot, Squares
 from service import export, topics
 from service.outputs import HealthOut, PolarOut, RangesOut, RectOut, SourceHealth
 from service.payloads import Encoder, RobotInfo, SensorPlace
@@ -92,19 +92,14 @@ def test_sent_sector_documents_hold(count: int, data: st.DataObject) -> None:
         ("front",),
     )
     check(Encoder().encode(PolarOut("laser", snapshot), 0)[0].payload)
-    x = column(numbers, float)
     x, row = column(numbers, float).reshape(1, count), (1, count)
     rect = RectSnapshot(
         0,
         Pose2(),
         np.linspace(-1, 1, count + 1),
         np.array([0.0, 1.0]),
-        state.reshape(row),
-        x,
-        x,
-        age.reshape(row),
-        source.reshape(row),
         ("front",),
+        lambda: Squares(state.reshape(row), x, x, age.reshape(row), source.reshape(row)),
     )
     check(Encoder().encode(RectOut("around", rect), 0)[0].payload)
 
