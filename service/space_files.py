@@ -57,7 +57,9 @@ def quadtree_of_file(file: Path, *, resolution_m: float | None = None) -> Extrac
         "nodes": tree.node_count,
         "divided": tree.division_count,
         "leaves": tree.leaf_count,
+        "entries": tree.entry_count,
         "bytes": len(data),
+        "cells_per_entry": round(patch.cells.size / tree.entry_count, 1),
         "cells_per_node": round(patch.cells.size / tree.node_count, 1),
         "cells_per_divided": round(patch.cells.size / max(tree.division_count, 1), 1),
     }

@@ -1,9 +1,10 @@
 """A grid map as a quadtree: squares of one kind are one leaf, mixed ones are divided in four (S31, algorithm 5.4).
 
 A leaf is all free, all occupied or all unknown. A cell that is neither for sure (partly free) is unknown here, as in
-picture files. Walls and the rim of what was seen cost nodes, rooms and the unknown outside nearly none: a real map has
-less than a twentieth of its cells in divided squares, which are what is kept (16 bytes each). Cells follow
-mapping.grids.geometry: [row, col], row with +y.
+picture files. Walls and the rim of what was seen cost nodes, rooms and the unknown outside nearly none. The two lowest
+levels are kept in place: a mixed square of 4 x 4 cells is one entry that says each of them, so that a real map takes
+less than a twentieth of its cells in entries (8 bytes each, four a node). Questions, counts and bytes are those of
+algorithm 5.4, which divides down to the cell. Cells follow mapping.grids.geometry: [row, col], row with +y.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ I32 = NDArray[np.int32]
 I8 = NDArray[np.int8]
 
 MAX_LEVELS: Final = 24  # 16.8 million cells an edge
+_LEAST_LEVELS: Final = 2  # a root of 4 x 4 cells
+_CELLS_A_NODE: Final = 128  # room that is made for a map at once: what is too small means writing all again
 MAX_WINDOW_CELLS: Final = 1 << 28
 MAX_CORNER: Final = 1 << 40
 # Squares of 2^i cells begin at multiples of 2^i, counted from here: so all quadtrees divide the plane alike. Up to 256
@@ -65,13 +68,13 @@ class Quadtree:
         self.resolution_m = check_resolution(resolution_m)
         self.free_below = free_below
         self.occupied_from = occupied_from
-        self._levels = 0
+        self._levels = _LEAST_LEVELS
         self._row0 = self._col0 = 0
         self._root: int = kernels.UNKNOWN
         self._begin(64)
 
     def _begin(self, room: int) -> None:
-        self._nodes: I32 = np.empty((room, 4), dtype=np.int32)
+        self._nodes: I64 = np.empty((room, 4), dtype=np.int64)
         self._spare: I32 = np.empty(room, dtype=np.int32)
         self._state: I64 = np.zeros(kernels.STATE_LENGTH, dtype=np.int64)
 
@@ -98,6 +101,8 @@ class Quadtree:
             return
         row0, col0 = int(patch.row0), int(patch.col0)
         self._cover(Window(row0, row0 + cells.shape[0], col0, col0 + cells.shape[1]))
+        while len(self._nodes) < self.record_count + cells.size // _CELLS_A_NODE:
+            self._grow()
         while True:
             self._state[kernels.FULL] = 0
             self._root = int(
@@ -137,7 +142,9 @@ class Quadtree:
         if max(abs(window.row0), abs(window.row1), abs(window.col0), abs(window.col1)) > MAX_CORNER:
             raise ValueError(f"a cell is more than {MAX_CORNER} cells from the origin")
         if self._root == kernels.UNKNOWN:
-            self._levels, self._row0, self._col0 = 0, window.row0, window.col0
+            self._levels = _LEAST_LEVELS
+            self._row0 = window.row0 - (window.row0 + BASE) % self.side
+            self._col0 = window.col0 - (window.col0 + BASE) % self.side
         levels = self._levels
         for low, end, corner in ((window.row0, window.row1, self._row0), (window.col0, window.col1, self._col0)):
             first, last = min(low, corner) + BASE, max(end - 1, corner + self.side - 1) + BASE
@@ -165,7 +172,7 @@ class Quadtree:
 
     def _grow(self) -> None:
         room = 2 * len(self._nodes)
-        nodes, spare = np.empty((room, 4), dtype=np.int32), np.empty(room, dtype=np.int32)
+        nodes, spare = np.empty((room, 4), dtype=np.int64), np.empty(room, dtype=np.int32)
         nodes[: len(self._nodes)], spare[: len(self._spare)] = self._nodes, self._spare
         self._nodes, self._spare = nodes, spare
 
@@ -241,31 +248,42 @@ class Quadtree:
     # ------------------------------------------------------------------ size and bytes
 
     @property
-    def division_count(self) -> int:
-        """Nodes that are divided."""
-        return int(self._state[kernels.TOP] - self._state[kernels.BACK])
+    def leaf_count(self) -> int:
+        """Leaves of algorithm 5.4, down to single cells. Time grows with the nodes."""
+        return int(kernels.leaves_below(self._root, self._nodes))
 
     @property
-    def leaf_count(self) -> int:
-        return 3 * self.division_count + 1
+    def division_count(self) -> int:
+        """Squares that algorithm 5.4 divides."""
+        return (self.leaf_count - 1) // 3
 
     @property
     def node_count(self) -> int:
         """Nodes of algorithm 5.4: leaves, and those divided."""
         return self.division_count + self.leaf_count
 
+    @property
+    def record_count(self) -> int:
+        """Nodes in memory, 32 bytes each: divided squares of 8 x 8 cells and larger."""
+        return int(self._state[kernels.TOP] - self._state[kernels.BACK])
+
+    @property
+    def entry_count(self) -> int:
+        """Squares that the tree knows of by itself: those divided, those of one kind, and mixed ones of 4 x 4 cells."""
+        return 4 * self.record_count + 1
+
     def to_bytes(self) -> bytes:
-        """A byte for each node that is divided, then packed; the same tree always gives the same bytes."""
+        """A byte for each square that algorithm 5.4 divides, then packed; the same tree always gives the same bytes."""
         body = np.zeros(self.division_count, dtype=np.uint8)
         kernels.write_tree(self._root, self._nodes, 0, body)
-        kind = 3 if self._root >= 0 else -1 - self._root
+        kind = 3 if self._root >= 0 or self._root <= kernels.MIXED else -1 - self._root
         plain = body.tobytes()
         fields = (MAGIC, VERSION, self.resolution_m, self._levels, self._row0, self._col0, kind, len(body))
         crc = zlib.crc32(plain, zlib.crc32(HEADER.pack(*fields, 0)))
         return HEADER.pack(*fields, crc) + zlib.compress(plain, 6)
 
     @classmethod
-    def from_bytes(cls, data: bytes, *, max_nodes: int = 1 << 26) -> Quadtree:
+    def from_bytes(cls, data: bytes, *, max_nodes: int = 1 << 25) -> Quadtree:
         """The quadtree that to_bytes wrote; ValueError if it is damaged, of another version or too large."""
         if len(data) < HEADER.size:
             raise ValueError("a stored quadtree is shorter than its header")
@@ -290,12 +308,25 @@ class Quadtree:
         ):
             raise ValueError("a stored quadtree is torn: its checksum does not fit")
         tree = cls(resolution_m=resolution_m)
+        body = np.frombuffer(plain, dtype=np.uint8).copy()
+        if levels < _LEAST_LEVELS:  # as written before roots had 4 x 4 cells
+            tree.write(GridPatch(resolution_m, row0, col0, _cells_of_tiny(levels, kind, body)))
+            return tree
         tree._begin(max(64, count))
         tree._levels, tree._row0, tree._col0, tree._root = levels, row0, col0, -1 - kind
         if kind == 3:
             place = np.zeros(1, dtype=np.int64)
-            body = np.frombuffer(plain, dtype=np.uint8).copy()
             tree._root = int(kernels.read_tree(tree.side, body, place, tree._nodes, tree._state))
-            if tree._root < 0 or place[0] != count:
+            if tree._root == kernels.DAMAGED or place[0] != count:
                 raise ValueError("a stored quadtree is damaged: its nodes do not fit together")
         return tree
+
+
+def _cells_of_tiny(levels: int, kind: int, body: NDArray[np.uint8]) -> I8:
+    """The cells of a stored root of one cell, or of 2 x 2."""
+    kinds = np.full((1 << levels, 1 << levels), kind)
+    if kind == 3:
+        kinds = (int(body[0]) >> np.arange(0, 8, 2) & 3).reshape(2, 2)
+        if levels == 0 or len(body) > 1 or np.any(kinds == 3):
+            raise ValueError("a stored quadtree is damaged: its nodes do not fit together")
+    return np.asarray(_PERCENT[kinds])

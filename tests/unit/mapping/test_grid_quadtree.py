@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapping.grids.evidence import FREE, OCCUPIED, UNKNOWN
 from mapping.grids.patch import GridPatch
-from mapping.grids.quadtree import HEADER, Quadtree
+from mapping.grids.quadtree import BASE, HEADER, MAGIC, VERSION, Quadtree
 from mapping.grids.tiles import Window
 
 I8 = NDArray[np.int8]
@@ -74,6 +74,59 @@ def test_written_cells_are_read_and_the_tree_is_that_of_the_algorithm(seeds: lis
     again = Quadtree(resolution_m=D)
     again.write(GridPatch(D, tree.window.row0, tree.window.col0, tree.cells_in(tree.window)))
     assert again.to_bytes() == tree.to_bytes()
+
+
+def entries_of(cells: I8) -> int:
+    """The same where squares of 4 x 4 cells are not divided."""
+    if len(cells) == 4 or np.all(cells == cells[0, 0]):
+        return 1
+    half = len(cells) // 2
+    parts = (cells[:half, :half], cells[:half, half:], cells[half:, :half], cells[half:, half:])
+    return 1 + sum(entries_of(part) for part in parts)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(0, 2**32 - 1), min_size=1, max_size=4))
+def test_what_is_kept_ends_with_squares_of_four_cells(seeds: list[int]) -> None:
+    tree = Quadtree(resolution_m=D)
+    for seed in seeds:
+        tree.write(patch_of(seed, speckle=0.2))
+    assert tree.entry_count == entries_of(tree.cells_in(tree.window))
+    assert tree.record_count == (tree.entry_count - 1) / 4
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**32 - 1))
+def test_a_pattern_that_repeats_is_no_square_of_one_kind(high: int, wide: int, seed: int) -> None:
+    """Squares beside each other that are mixed alike, as tiles of a floor are."""
+    rng = np.random.default_rng(seed)
+    cells = np.tile(rng.choice(np.array([-1, 0, 100], dtype=np.int8), (high, wide)), (9, 9))
+    patch, plain = GridPatch(D, int(rng.integers(-60, 60)), 3, cells), Plain()
+    plain.write(patch)
+    tree = Quadtree.of_patch(patch)
+    assert np.array_equal(tree.cells_in(EVERYWHERE), plain.cells)
+    assert tree.node_count == nodes_of(tree.cells_in(tree.window))
+    assert tree.entry_count == entries_of(tree.cells_in(tree.window))
+    again = Quadtree(resolution_m=D)
+    again.merge(tree)
+    assert np.array_equal(again.cells_in(EVERYWHERE), plain.cells)
+    assert np.array_equal(Quadtree.from_bytes(tree.to_bytes()).cells_in(EVERYWHERE), plain.cells)
+
+
+@pytest.mark.parametrize("kinds", [np.array([[1]]), np.array([[2]]), np.array([[0, 1], [2, 1]]), np.full((2, 2), 2)])
+def test_roots_of_one_and_of_four_cells_were_stored_once_and_are_read(kinds: NDArray[np.int64]) -> None:
+    levels, kind = len(kinds) - 1, int(kinds[0, 0])
+    body = b""
+    if np.any(kinds != kind):
+        kind, body = 3, bytes([int((kinds.ravel() << np.arange(0, 8, 2)).sum())])
+    corner = -BASE % (1 << levels) - 4
+    fields = (MAGIC, VERSION, D, levels, corner, corner, kind, len(body))
+    crc = zlib.crc32(body, zlib.crc32(HEADER.pack(*fields, 0)))
+    tree = Quadtree.from_bytes(HEADER.pack(*fields, crc) + zlib.compress(body))
+    side = len(kinds)
+    found = tree.cells_in(Window(corner, corner + side, corner, corner + side))
+    assert np.array_equal(found, np.array([-1, 0, 100])[kinds])
+    assert tree.count_in(EVERYWHERE).unknown == 160_000 - np.count_nonzero(kinds)
 
 
 @settings(max_examples=40, deadline=None)
