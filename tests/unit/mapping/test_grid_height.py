@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -200,6 +201,44 @@ def test_no_driven_way_in_a_sector_meets_what_is_not_traversable(seed: int) -> N
                 assert 0 <= row < found.ground.shape[0]
                 assert 0 <= col < found.ground.shape[1]
                 assert found.ground[row, col] == Ground.TRAVERSABLE
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_sector_ends_at_the_first_cell_that_is_not_traversable(seed: int) -> None:
+    """Which cells' circles meet a wedge, and how near they come, by shapely; a millionth of a metre may be either."""
+    rng = np.random.default_rng(seed)
+    cloud = floor_points(3.0, per_cell=4, seed=seed)
+    for hole in rng.normal(0.0, 1.0, (2, 2)):
+        cloud = cloud[np.hypot(*(cloud[:, :2] - hole).T) > 0.25]
+    high = rng.random((60, 60)) < 0.01
+    cell = np.floor(cloud[:, :2] / D + 1e-9).astype(int)
+    cloud[high[cell[:, 0], cell[:, 1]], 2] = 0.5
+    found = elevation_of(cloud)
+    pose = Pose2(float(rng.normal(0.0, 0.4)), float(rng.normal(0.0, 0.4)), float(rng.uniform(-3.0, 3.0)))
+    bounds = np.cumsum(rng.uniform(0.2, 1.5, 5)) - 3.0
+    reach_m, radius = 1.8, D * math.sqrt(0.5)
+    ground = ground_in_sectors(found, pose, bounds, reach_m=reach_m)
+    rows, cols = np.mgrid[-40:40, -40:40].reshape(2, -1)
+    r, c = rows - found.row0, cols - found.col0
+    known = (r >= 0) & (r < found.ground.shape[0]) & (c >= 0) & (c < found.ground.shape[1])
+    kind = np.full(len(rows), int(Ground.UNKNOWN))
+    kind[known] = found.ground[r[known], c[known]]
+    middle = np.stack(((cols + 0.5) * D, (rows + 0.5) * D), axis=-1)
+    nearest = np.maximum(np.hypot(*(middle - [pose.x_m, pose.y_m]).T) - radius, 0.0)
+    for k in range(4):
+        bearing = pose.yaw_rad + np.array([bounds[k], (bounds[k] + bounds[k + 1]) / 2.0, bounds[k + 1]])
+        far = np.stack((pose.x_m + 99.0 * np.cos(bearing), pose.y_m + 99.0 * np.sin(bearing)), axis=-1)
+        away = shapely.distance(shapely.Polygon([(pose.x_m, pose.y_m), *far]), shapely.points(middle))
+        stops = kind != Ground.TRAVERSABLE
+        latest = nearest[stops & (away < radius - 1e-6)].min(initial=reach_m)
+        earliest = nearest[stops & (away < radius + 1e-6)].min(initial=reach_m)
+        assert earliest - 1e-6 <= ground.traversable_m[k] <= latest + 1e-6
+        if earliest < reach_m - 1e-6:
+            at = stops & (away < radius + 1e-6) & (np.abs(nearest - ground.traversable_m[k]) < 1e-6)
+            assert ground.stopped_by[k] in kind[at]
+        else:
+            assert ground.stopped_by[k] == Ground.TRAVERSABLE or latest < reach_m + 1e-6
 
 
 def test_an_unknown_ground_stops_at_once_and_bad_sectors_are_refused() -> None:
