@@ -46,7 +46,7 @@ from service.outputs import HealthOut, OdomOut, Output, PolarOut, PoseOut, Range
 from service.payloads import RobotInfo, SensorPlace
 from service.publisher import Publisher
 from service.recording import RecordedFusion, Recorder
-from service.resident import give_back_code
+from service.resident import give_back_code, give_back_heap
 from service.ros import RosSettings
 from service.rpc import CallRefused
 from service.sensors import Chain, Laser
@@ -104,6 +104,7 @@ class Daemon:
                 return 0
             gc.collect()
             gc.freeze()  # modules and kernels stay: looking through them again would hold every thread for 50 ms
+            give_back_heap()  # what loading the kernels left
             try:
                 self._notifier.ready(self._summary())
                 log.info("%s", self._summary())
@@ -113,7 +114,7 @@ class Daemon:
                     self._notifier.status(self._summary())
                     turns += 1
                     if turns in _GIVE_BACK_AT_S:
-                        log.debug("%.0f MB of code that only starting needed given back", give_back_code() / 1e6)
+                        log.debug("%.0f MB that only starting needed given back", give_back_code() / 1e6)
             finally:
                 log.info("stopping: closing ports, saving the map")
                 self._notifier.stopping("closing ports and saving the map")

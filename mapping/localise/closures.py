@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.kernels.graph_ways import lengths_from
 from mapping.localise.closure_records import (
     Closure,
     ClosureSettings,
@@ -143,20 +144,12 @@ class Work:
 
     def _ways(self, keys: tuple[int, ...]) -> F64:
         """(K, N) length of the shortest way through the graph from each key to every other."""
-        from scipy.sparse import csr_matrix
-        from scipy.sparse.csgraph import dijkstra
-
         shot = self.snapshot
         edges = self._edges(shot.closures)
         length = np.hypot(edges.measured[:, 0], edges.measured[:, 1]) + 1e-3
-        order = np.lexsort((length, edges.to, edges.start))  # of parallel edges the shortest
-        pair = edges.start[order] * len(shot.poses) + edges.to[order]
-        first = np.concatenate(([True], pair[1:] != pair[:-1]))
-        chosen = order[first]
-        graph = csr_matrix(
-            (length[chosen], (edges.start[chosen], edges.to[chosen])), shape=(len(shot.poses), len(shot.poses))
-        )
-        return np.asarray(dijkstra(graph, directed=False, indices=np.array(keys)))
+        starts, count = np.array(keys, dtype=np.int64), len(shot.poses)
+        ways: F64 = lengths_from(starts, edges.start, edges.to, length, count)
+        return ways
 
     def _places(self, key: int, way_m: F64) -> tuple[list[int], list[int]]:
         """Keys at the middle of places to compare with: those near enough to track, and those to search."""

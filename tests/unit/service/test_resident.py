@@ -45,17 +45,22 @@ def test_the_compiler_is_given_back_and_everything_goes_on() -> None:
     assert less > 0.7 * given
 
 
-def test_only_unwritten_code_of_files_is_looked_at() -> None:
+def test_only_code_and_constants_of_files_are_looked_at() -> None:
     lines = [
         "00400000-00500000 r-xp 00000000 08:01 42 /usr/lib/libx y.so",
         "Rss:                 512 kB",
         "Private_Dirty:         0 kB",
         "VmFlags: rd ex mr mw me",
-        "00500000-00600000 rw-p 00000000 08:01 42 /usr/lib/libx y.so",
+        "00500000-00580000 r--p 00000000 08:01 42 /usr/lib/libx y.so",
+        "Rss:                 200 kB",
+        "00580000-00600000 rw-p 00000000 08:01 42 /usr/lib/libx y.so",
         "Rss:                 100 kB",
         "00600000-00700000 r-xp 00000000 00:00 0 [vdso]",
         "Rss:                   4 kB",
         "00700000-00800000 r-xp 00000000 00:00 0",
         "Rss:                   8 kB",
     ]
-    assert _code_of_files(lines) == [(0x400000, 0x500000, {"Rss": 512, "Private_Dirty": 0})]
+    assert _code_of_files(lines) == [
+        (0x400000, 0x500000, {"Rss": 512, "Private_Dirty": 0}),
+        (0x500000, 0x580000, {"Rss": 200}),
+    ]
