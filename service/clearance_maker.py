@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mapping.grids.clearance import MAX_SIDE_CELLS, DistanceField
 from mapping.grids.patch import GridPatch
+from mapping.kernels import clearance_costs as kernels
 from mapping.scan import Scan
 from service.map_makers import MapView, Rect, Tile
 from service.outputs import GridOut, Output
@@ -47,6 +48,8 @@ class ClearanceMaker:
         self._unknown_is_obstacle = unknown_is_obstacle
         self._field: DistanceField | None = None
         self._place: tuple[float, int, int] | None = None
+        self._costs: I8 = np.zeros(1, dtype=np.int8)
+        self._layer: I8 = np.zeros((0, 0), dtype=np.int8)
         self._epoch = 0
 
     @property
@@ -63,42 +66,47 @@ class ClearanceMaker:
         grid = view.grid
         if grid is None or not view.changed or grid.cells.size == 0 or max(grid.cells.shape) > MAX_SIDE_CELLS - 2:
             return []
-        field = self._follow(grid, view.changed)
-        rows, cols = _known_part(grid.cells)
-        cells = np.full(grid.cells[rows, cols].shape, -1, dtype=np.int8)
-        known = grid.cells[rows, cols] >= 0
-        costs = self._costs(grid.resolution_m)
-        squared = field.squared[1:-1, 1:-1][rows, cols]
-        cells[known] = costs[np.minimum(squared[known], len(costs) - 1)]
+        cells = np.ascontiguousarray(grid.cells)
+        self._follow(grid, cells, view.changed)
+        row0, row1, col0, col1 = kernels.known_box(cells)
+        row1, col1 = max(row1, row0 + 1), max(col1, col0 + 1)  # one cell if nothing is known
         self._epoch += 1
-        patch = GridPatch(grid.resolution_m, grid.row0 + rows.start, grid.col0 + cols.start, cells)
+        known = self._layer[row0:row1, col0:col1].copy()
+        patch = GridPatch(grid.resolution_m, grid.row0 + row0, grid.col0 + col0, known)
         return [GridOut(view.stamp_ns, self._epoch, patch, name=NAME)]
 
-    def _follow(self, grid: GridPatch, changed: tuple[Rect, ...]) -> DistanceField:
+    def _follow(self, grid: GridPatch, cells: I8, changed: tuple[Rect, ...]) -> None:
+        """Bring distances and costs up to date."""
         place = (grid.resolution_m, grid.row0, grid.col0)
         field = self._field
-        rows, cols = grid.cells.shape
+        rows, cols = cells.shape
         if field is None or self._place != place or field.shape != (rows + 2, cols + 2):
-            around = np.pad(self._obstacles(grid.cells), 1, constant_values=self._unknown_is_obstacle)
+            around = np.pad(self._obstacles(cells), 1, constant_values=self._unknown_is_obstacle)
             reach = math.ceil(self._reach_m / grid.resolution_m)
             field = self._field = DistanceField(around, reach_cells=reach)  # a rim of a cell: outside, nothing is known
-            self._place = place
-            return field
-        added, removed = [], []
-        for rect in changed:
-            row, col = max(rect.row0 - grid.row0, 0), max(rect.col0 - grid.col0, 0)
-            part = np.s_[row : rect.row0 + rect.rows - grid.row0, col : rect.col0 + rect.cols - grid.col0]
-            now, was = self._obstacles(grid.cells[part]), field.obstacle[1:-1, 1:-1][part]
-            added.append(np.argwhere(now & ~was) + (row + 1, col + 1))
-            removed.append(np.argwhere(was & ~now) + (row + 1, col + 1))
-        field.update(np.concatenate(added), np.concatenate(removed))
-        return field
+            self._place, self._costs = place, self._costs_of(grid.resolution_m)
+            self._layer = np.empty((rows, cols), dtype=np.int8)
+            everywhere = np.tile(np.array([1, cols + 1], dtype=np.int32), (rows + 2, 1))
+            kernels.put_costs(cells, field.squared, self._costs, everywhere, self._layer)
+            return
+        added, removed = [np.zeros((0, 2), dtype=np.int64)], [np.zeros((0, 2), dtype=np.int64)]
+        parts = [_part_of(rect, grid) for rect in changed]
+        for part in parts:
+            seen = (cells, part, _OCCUPIED_PERCENT, self._unknown_is_obstacle, field.obstacle)
+            came, went = (np.empty((n, 2), dtype=np.int64) for n in kernels.count_changed(*seen))
+            kernels.list_changed(*seen, came, went)
+            added.append(came)
+            removed.append(went)
+        spans = field.update(np.concatenate(added), np.concatenate(removed))
+        kernels.put_costs(cells, field.squared, self._costs, spans, self._layer)
+        for part in parts:
+            kernels.put_seen(cells, field.squared, self._costs, part, self._layer)
 
     def _obstacles(self, cells: I8) -> Bools:
         occupied = cells >= _OCCUPIED_PERCENT
         return occupied | (cells < 0) if self._unknown_is_obstacle else occupied
 
-    def _costs(self, resolution_m: float) -> I8:
+    def _costs_of(self, resolution_m: float) -> I8:
         """By squared distance in cells, the last for all that is farther; rounded so that no distance grows."""
         farthest = math.ceil((self._reach_m / resolution_m) ** 2)
         share = np.sqrt(np.arange(farthest + 1)) * (resolution_m / self._reach_m)
@@ -112,10 +120,9 @@ class ClearanceMaker:
         self._field = None
 
 
-def _known_part(cells: I8) -> tuple[slice, slice]:
-    """Rows and columns around what is known; one cell if nothing is."""
-    known = cells >= 0
-    rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-    if not len(rows):
-        return slice(0, 1), slice(0, 1)
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+def _part_of(rect: Rect, grid: GridPatch) -> tuple[int, int, int, int]:
+    """Rows and columns [row0, row1, col0, col1) of a grid's array that a rectangle of the map covers."""
+    rows, cols = grid.cells.shape
+    row, col = rect.row0 - grid.row0, rect.col0 - grid.col0
+    row0, row1, col0, col1 = np.clip((row, row + rect.rows, col, col + rect.cols), 0, (rows, rows, cols, cols))
+    return int(row0), int(row1), int(col0), int(col1)

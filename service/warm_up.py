@@ -230,9 +230,14 @@ def _main() -> None:
 
 
 def _clearance() -> None:
-    from mapping.grids.clearance import DistanceField
+    from mapping.grids.patch import GridPatch
+    from service.clearance_maker import ClearanceMaker
+    from service.map_makers import MapView, Rect
 
-    DistanceField(np.eye(3, dtype=np.bool_), reach_cells=2).update([(0, 1), (0, 2)], [(0, 0), (1, 1)])
+    cells, maker = np.full((3, 3), -1, dtype=np.int8), ClearanceMaker(reach_m=2.0)
+    for seen in (100, 0):
+        cells[1, 1] = seen
+        maker.make(MapView(0, GridPatch(1.0, 0, 0, cells), (Rect(0, 0, 3, 3),), None))
 
 
 def _footprint(config: Config) -> None:

@@ -97,6 +97,26 @@ def test_changes_give_what_a_new_map_gives() -> None:
     np.testing.assert_array_equal(in_frame(told(maker, patch), patch), expected(patch))
 
 
+@pytest.mark.parametrize("unknown_is_obstacle", [False, True])
+def test_parts_that_reach_out_of_the_grid_or_lie_over_each_other(unknown_is_obstacle: bool) -> None:
+    """What changed may be told of in any rectangles that cover it."""
+    rng = np.random.default_rng(6)
+    patch = grid(random_cells(7))
+    maker = ClearanceMaker(reach_m=REACH_M, unknown_is_obstacle=unknown_is_obstacle)
+    told(maker, patch)
+    for number in range(20):
+        part = np.s_[0 : int(rng.integers(1, 60)), int(rng.integers(0, 90)) :]
+        patch.cells[part] = random_cells(40 + number)[part]
+        rows, cols = patch.cells[part].shape
+        end = patch.col0 + 90
+        changed = [Rect(patch.row0 - 9, end - cols, rows + 9, cols + 5), Rect(patch.row0, end - cols, rows, cols)]
+        changed += [Rect(patch.row0 - 20, patch.col0, 9, 9), Rect(patch.row0, patch.col0 - 30, 9, 9)]
+        changed += [Rect(patch.row0 + 70, patch.col0, 9, 9), Rect(patch.row0, end + 3, 9, 9)]
+        output = told(maker, patch, *changed)
+        want = expected(patch, unknown_is_obstacle=unknown_is_obstacle)
+        np.testing.assert_array_equal(in_frame(output, patch), want)
+
+
 def test_it_is_cut_to_what_is_known_and_nothing_is_told_without_a_change() -> None:
     cells = np.full((128, 128), -1, dtype=np.int8)
     cells[40:60, 30:90] = 0
