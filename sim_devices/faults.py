@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 from sim_devices.contact import Contact, floor_under
 from sim_devices.device import F64, ByteDevice, CanDevice, Frame, Mount, Scene
 from sim_devices.encoder_cia406 import Cia406Encoder
+from sim_devices.ranging import ManyAtOnce
 from sim_devices.slcan_hub import CanBus
 from sim_devices.sonar_usboard import UsBoard, UsBoardCan, UsBoardSerial
 from sim_devices.wheel import DrivenScene, Faulty, Side, Undo
@@ -381,6 +382,18 @@ class FaultyScene:
                 )
                 range_m = change(range_m.copy(), fault, sight)
         return range_m
+
+    def is_beam_by_beam(self, first_ns: int, last_ns: int) -> bool:
+        """See `ranging.ManyAtOnce`: where no fault changes what is seen."""
+        scene = self._scene
+        if not isinstance(scene, ManyAtOnce) or not scene.is_beam_by_beam(first_ns, last_ns):
+            return False
+        begin_ns, end_ns = self._plan.now_ns(first_ns), self._plan.now_ns(last_ns)
+        return not any(
+            fault.hits(self._target) and fault.start_ns <= end_ns and fault.end_ns > begin_ns
+            for fault in self._plan.faults
+            if fault.kind == "frozen" or fault.kind in BEAM_FAULTS
+        )
 
     def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
         frozen = self._plan.active(self._target, "frozen", now_ns)

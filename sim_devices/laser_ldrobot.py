@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.checksums import ldrobot_crc
-from sim_devices.device import Mount, Scene
-from sim_devices.ranging import Ranger, garbled
+from sim_devices.device import F64, Mount, Scene
+from sim_devices.ranging import MOST_FORESEEN, Ranger, garbled
 from sim_devices.spinner import Spinner
 from sim_devices.wire import SECOND_NS, PacedWire
 
@@ -66,6 +66,11 @@ def encode_packet(speed_dps: int, start: int, end: int, distances_mm: I64, inten
         body += struct.pack("<HB", distance, intensity)
     body += struct.pack("<HH", end, time_ms)
     return bytes(body) + bytes((ldrobot_crc(bytes(body)),))
+
+
+def _bearing_rad(turns: F64) -> F64:
+    """Counter-clockwise; the head turns clockwise."""
+    return -2.0 * np.pi * turns
 
 
 class LdLidar:
@@ -121,6 +126,8 @@ class LdLidar:
         if received and fits and self.profile.obeys and now_ns >= self._zero_ns:
             self._take(received, now_ns)
         while self._done_ns(self._next_packet) <= now_ns:
+            if self._next_packet >= self._foreseen and self._done_ns(self._next_packet + 1) <= now_ns:
+                self._foresee(now_ns)
             if self._told_share:
                 self._wire.send(self._packet(self._next_packet), self._done_ns(self._next_packet), whole=True)
             self._next_packet += 1
@@ -140,7 +147,7 @@ class LdLidar:
         """Start as after the supply came back: the motor spins up, then packets come without end."""
         self._powered = True
         self._zero_ns = now_ns + self._boot_ns
-        self._next_packet = 0
+        self._next_packet = self._foreseen = 0  # up to that one the scene has been asked
         self._wire = PacedWire(self.profile.line_rate_bps, now_ns)
         self._buffer = bytearray()
         self._clock_zero_ns = now_ns
@@ -185,13 +192,25 @@ class LdLidar:
     def _done_ns(self, packet: int) -> int:
         return self._sample_ns(packet * SAMPLES + SAMPLES - 1)
 
+    def _stamps_ns(self, packet: int, count: int = 1) -> F64:
+        """(12 count,) when the samples of these packets are taken."""
+        samples = range(packet * SAMPLES, (packet + count) * SAMPLES)
+        return np.array([self._sample_ns(sample) for sample in samples], dtype=np.float64)
+
+    def _foresee(self, now_ns: int) -> None:
+        """Several packets are due: see `Ranger.foresee`."""
+        late_s = (now_ns - self._done_ns(self._next_packet)) / SECOND_NS
+        count = min(1 + int(late_s * self.profile.samples_per_s / SAMPLES), MOST_FORESEEN // SAMPLES)
+        self._foreseen = self._next_packet + count
+        stamp_ns = self._stamps_ns(self._next_packet, count)
+        self._ranger.foresee(_bearing_rad(self._motor.turns(stamp_ns)), stamp_ns)
+
     def _packet(self, packet: int) -> bytes:
-        first = packet * SAMPLES
-        stamp_ns = np.array([self._sample_ns(first + k) for k in range(SAMPLES)], dtype=np.float64)
+        stamp_ns = self._stamps_ns(packet)
         turns = self._motor.turns(stamp_ns)
         angle = np.rint(turns % 1.0 * 36000.0).astype(np.int64) % 36000
         speed_dps = (turns[-1] - turns[0]) * 360.0 / ((stamp_ns[-1] - stamp_ns[0]) * 1e-9)
-        range_m = self._ranger.measure(-2.0 * np.pi * turns, stamp_ns)
+        range_m = self._ranger.measure(_bearing_rad(turns), stamp_ns)
         good = np.isfinite(range_m)
         range_m = np.where(good, range_m, 0.0)
         good &= (range_m >= self.profile.range_min_m) & (range_m <= self.profile.range_max_m) & (not self._trouble)

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.device import F64, Mount, Scene
-from sim_devices.ranging import Ranger, garbled
+from sim_devices.ranging import MOST_FORESEEN, Ranger, garbled
 from sim_devices.spinner import Spinner
 from sim_devices.wire import SECOND_NS, PacedWire
 
@@ -130,6 +130,8 @@ class _Scan:
     forced: bool
     zero_ns: int | None = None
     next_batch: int = 0
+    foreseen: int = 0  # up to this batch the scene has been asked
+    offsets: I64 | None = None  # of those batches
     is_first: bool = True
     last_turn: int | None = None
 
@@ -137,6 +139,28 @@ class _Scan:
     def batch(self) -> int:
         """Samples that leave together."""
         return SAMPLES_A_CAPSULE if self.mode.answer == ANSWER_CAPSULES else NODES_A_BATCH
+
+    def stamps_ns(self, first_ns: int, count: int = 1) -> F64:
+        """(batch count,) when the samples of so many batches are taken."""
+        return first_ns + np.arange(count * self.batch, dtype=np.float64) * self.mode.sample_ns
+
+    def next_offsets(self) -> I64 | None:
+        """(batch,) of the next batch, if they have been worked out; `next_batch` is one more already."""
+        if self.offsets is None or self.next_batch > self.foreseen:
+            return None
+        begin = len(self.offsets) - (self.foreseen - self.next_batch + 1) * self.batch
+        return self.offsets[begin : begin + self.batch]
+
+
+def _bearing_rad(turns: F64) -> F64:
+    """Counter-clockwise; the head turns clockwise."""
+    return -2.0 * np.pi * turns
+
+
+def _turned_back(turns: F64, offset: I64) -> F64:
+    """Turns less offsets in eighths of a degree."""
+    back: F64 = turns - offset / (8.0 * 360.0)
+    return back
 
 
 class RpLidar:
@@ -426,17 +450,33 @@ class RpLidar:
             done_ns = self._batch_done_ns(scan, scan.zero_ns)
             if done_ns > now_ns:
                 return
+            if scan.next_batch >= scan.foreseen:
+                self._foresee(scan, done_ns, now_ns)
             first_ns = done_ns - (scan.batch - 1) * scan.mode.sample_ns
             scan.next_batch += 1
             slow = self._motor.speed(first_ns) < SLOWEST_SHARE * self.profile.turns_per_s
             if slow and not scan.forced:
                 continue
-            stamp_ns = first_ns + np.arange(scan.batch, dtype=np.float64) * scan.mode.sample_ns
+            stamp_ns = scan.stamps_ns(first_ns)
             turns = self._motor.turns(stamp_ns)
             if scan.mode.answer == ANSWER_CAPSULES:
                 self._wire.send(self._capsule(scan, turns, stamp_ns), done_ns, whole=True)
             else:
                 self._wire.send(self._nodes(scan, turns, stamp_ns), done_ns, whole=True)
+
+    def _foresee(self, scan: _Scan, done_ns: int, now_ns: int) -> None:
+        """Several batches are due: see `Ranger.foresee`."""
+        count = min((now_ns - done_ns) // (scan.batch * scan.mode.sample_ns) + 1, MOST_FORESEEN // scan.batch)
+        stamp_ns = scan.stamps_ns(done_ns - (scan.batch - 1) * scan.mode.sample_ns, count)
+        scan.offsets = None
+        if count < 2 or not self._ranger.may_foresee(stamp_ns):
+            return
+        scan.foreseen = scan.next_batch + count
+        turns = self._motor.turns(stamp_ns)
+        if scan.mode.answer == ANSWER_CAPSULES:
+            scan.offsets = self._offsets(turns, stamp_ns)
+            turns = _turned_back(turns, scan.offsets)
+        self._ranger.foresee(_bearing_rad(turns), stamp_ns)
 
     def _nodes(self, scan: _Scan, turns: F64, stamp_ns: F64) -> bytes:
         """Samples as 5-byte nodes."""
@@ -455,8 +495,10 @@ class RpLidar:
 
     def _capsule(self, scan: _Scan, turns: F64, stamp_ns: F64) -> bytes:
         """32 samples as one express capsule."""
-        offset = self._offsets(turns, stamp_ns)
-        distance, _ = self._distances(turns - offset / (8.0 * 360.0), stamp_ns)
+        offset = scan.next_offsets()
+        if offset is None:
+            offset = self._offsets(turns, stamp_ns)
+        distance, _ = self._distances(_turned_back(turns, offset), stamp_ns)
         if self.points_left_out:
             distance[self._random.random(scan.batch) < self.points_left_out] = 0
         start = round(float(turns[0] % 1.0) * ANGLE_UNITS) % ANGLE_UNITS
@@ -469,7 +511,7 @@ class RpLidar:
         if not self.lever_m:
             return np.zeros(len(turns), np.int64)
         ranger = self._ranger
-        true_m = ranger.scene.beam_ranges(ranger.mount, -2.0 * np.pi * turns, stamp_ns, ranger.range_max_m)
+        true_m = ranger.scene.beam_ranges(ranger.mount, _bearing_rad(turns), stamp_ns, ranger.range_max_m)
         seen_m = np.where(np.isfinite(true_m), np.maximum(true_m, self.profile.range_min_m), ranger.range_max_m)
         eighths = np.degrees(np.arctan(self.lever_m / seen_m)) * 8.0
         offsets: I64 = np.clip(np.rint(eighths), 0, MAX_OFFSET).astype(np.int64)
@@ -477,7 +519,7 @@ class RpLidar:
 
     def _distances(self, turns: F64, stamp_ns: F64) -> tuple[I64, I64]:
         """Distances in quarter millimetres, 0 where there is none, and qualities of samples."""
-        range_m = self._ranger.measure(-2.0 * np.pi * turns, stamp_ns)
+        range_m = self._ranger.measure(_bearing_rad(turns), stamp_ns)
         good = np.isfinite(range_m)
         range_m = np.where(good, range_m, 0.0)
         good &= (range_m >= self.profile.range_min_m) & (range_m <= self._ranger.range_max_m)

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from sim_devices.device import F64, Mount, Scene
+
+MOST_FORESEEN = 4096  # beams
+
+
+@runtime_checkable
+class ManyAtOnce(Protocol):
+    """A scene that may be asked for many beams in one go."""
+
+    def is_beam_by_beam(self, first_ns: int, last_ns: int) -> bool:
+        """Whether between these times each beam's range depends on nothing but itself."""
 
 
 @dataclass(slots=True)
@@ -25,13 +36,38 @@ class Ranger:
     noise_per_range: float = 0.0
     noise_scale: float = 1.0
     dropout: float = 0.0
+    _foreseen: tuple[F64, F64, F64] | None = field(default=None, init=False)  # stamps, bearings, true ranges
+
+    def foresee(self, bearing_rad: F64, stamp_ns: F64) -> None:
+        """Ask the scene at once for beams (N,) that will be measured in several parts from now on.
+
+        Asking has a price of its own, whatever the number of beams: a device that is served late, and asked for each
+        part by itself, would fall behind for ever on a machine with too much work. What is measured stays the same.
+        """
+        if self.may_foresee(stamp_ns):
+            true_m = self.scene.beam_ranges(self.mount, bearing_rad, stamp_ns, self.range_max_m)
+            self._foreseen = stamp_ns, bearing_rad, true_m
+
+    def may_foresee(self, stamp_ns: F64) -> bool:
+        """Whether beams at these times (N,) have the same ranges asked together or in parts."""
+        scene, self._foreseen = self.scene, None
+        return isinstance(scene, ManyAtOnce) and scene.is_beam_by_beam(int(stamp_ns[0]), int(stamp_ns[-1]))
+
+    def _true_m(self, bearing_rad: F64, stamp_ns: F64) -> F64:
+        if self._foreseen is not None:
+            stamps, bearings, ranges = self._foreseen
+            first = int(np.searchsorted(stamps, stamp_ns[0]))
+            part = slice(first, first + len(stamp_ns))
+            if np.array_equal(stamps[part], stamp_ns) and np.array_equal(bearings[part], bearing_rad):
+                return ranges[part]
+        return self.scene.beam_ranges(self.mount, bearing_rad, stamp_ns, self.range_max_m)
 
     def measure(self, bearing_rad: F64, stamp_ns: F64) -> F64:
         """Ranges (N,) of beams fired at their stamps; +inf no echo, NaN blinded, -inf and below 0 too close.
 
         bearing_rad: (N,) in the sensor frame, counter-clockwise.
         """
-        true_m = self.scene.beam_ranges(self.mount, bearing_rad, stamp_ns, self.range_max_m)
+        true_m = self._true_m(bearing_rad, stamp_ns)
         seen_m = true_m
         if self.noise_scale:
             sigma_m = self.noise_floor_m + self.noise_per_range * np.where(np.isfinite(true_m), true_m, 0.0)

@@ -390,6 +390,10 @@ class SimScene:
         world_s = (stamps - self.origin_ns) * (1e-9 * self.speed)
         return self.world.beam_distances(origin, heading, world_s, z_m=mount.z_m, range_max_m=range_max_m)
 
+    def is_beam_by_beam(self, first_ns: int, last_ns: int) -> bool:
+        """See `ranging.ManyAtOnce`."""
+        return True
+
     def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
         """See `device.Scene`."""
         pose = self._pose_now(now_ns)
