@@ -18,10 +18,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
-GIVE_UP_S = 60.0
-"""A machine that does not come round in a minute is broken, or the program is."""
+GIVE_UP_S = 120.0
+"""A machine that does not come round in two minutes is broken, or the program is."""
 
-START_S = 150.0
+START_S = 300.0
 """For what may have to compile all kernels first, beside other tests."""
 
 T = TypeVar("T")

@@ -19,7 +19,6 @@ EMPTY = Scan(0, 0.0, np.zeros(0), np.zeros(0), 0.05, 30.0)
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_loop_of_two_hundred_metres_is_closed_and_nothing_else() -> None:
     case = simulated("block", BLOCK, 5)
     assert np.hypot(*(case.odometry[:, :2] - case.truth[:, :2]).T).max() > 5.0  # or the test would prove nothing
@@ -32,7 +31,6 @@ def test_a_loop_of_two_hundred_metres_is_closed_and_nothing_else() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_corridors_that_all_look_alike_are_not_taken_for_each_other() -> None:
     """Each is like the next but one, 15 m aside, which was seen before it: only the way there tells them apart."""
     case = simulated("alike", ALIKE, 4)
@@ -45,7 +43,6 @@ def test_corridors_that_all_look_alike_are_not_taken_for_each_other() -> None:
 
 
 @pytest.mark.data
-@pytest.mark.timeout(120)
 @pytest.mark.skipif(not os.environ.get("UMFELD_DATA"), reason="needs UMFELD_DATA")
 def test_halls_seen_every_metre_are_closed() -> None:
     """Its headings drift by 15 degrees and its few second visits are short: votes must not be asked for that true

@@ -33,7 +33,6 @@ def relations_of(name: str) -> Relations:
 
 @pytest.mark.data
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 @needs_data
 @pytest.mark.parametrize(("name", "most_m", "most_deg"), [("intel", 0.022, 0.45), ("fr079", 0.043, 0.53)])
 def test_the_relation_error_is_as_small_as_promised(name: str, most_m: float, most_deg: float, tmp_path: Path) -> None:
@@ -51,7 +50,6 @@ def test_the_relation_error_is_as_small_as_promised(name: str, most_m: float, mo
 
 @pytest.mark.data
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @needs_data
 def test_both_loops_of_a_campus_outdoors_are_closed() -> None:
     """It ends two metres beside where it began, driving in the same street. Round a hedge matches turned the map by 22

@@ -32,7 +32,6 @@ def sweep(step: int, rng: np.random.Generator) -> tuple[Pose2, Scan]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_fifty_laps_of_a_room_keep_the_views_of_some() -> None:
     slam, pending, held = Slam(keep_scans=False), None, []
     rng = np.random.default_rng(3)

@@ -29,7 +29,7 @@ def _warm_up(cache: Path, *, stop: bool = False) -> tuple[object, str]:
     """What came of it, and what was logged."""
     ran = subprocess.run(
         [sys.executable, "-c", _TRY, json.dumps(_SMALL), "stop" if stop else "go"],
-        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)}, capture_output=True, text=True, timeout=280, check=True,
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)}, capture_output=True, text=True, timeout=800, check=True,
     )  # fmt: skip
     return json.loads(ran.stdout.splitlines()[-1]), ran.stderr
 
@@ -60,5 +60,5 @@ with warm_up._compilations() as compiled:
     warm_up.warm_up_for_logs()
 print(len(compiled))
 """
-    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=280, check=True)
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=800, check=True)
     assert ran.stdout.strip() == "0"
