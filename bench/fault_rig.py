@@ -290,7 +290,10 @@ class Rig:
             if (address := device.serial_port() or "").startswith("udp"):
                 return MemoryUdpPort(link, address, lambda: self.now_ns)
             line = MemoryPort(link, name, baud, lambda: self.now_ns, on_tcp=on_tcp)
-            return _MemoryCanPort(line, lambda: self.now_ns) if wire.name.startswith("can-") else line
+            if not wire.name.startswith("can-"):
+                return line
+            bus = self.config.can[wire.name.removeprefix("can-")]
+            return _MemoryCanPort(line, bus.bitrate_bps, lambda: self.now_ns)
 
         conversations = {source: make() for source, make in wire.conversations.items()}
         return WireReader(
@@ -317,9 +320,9 @@ def config_of(table: Table) -> Config:
 class _MemoryCanPort(CanPort):
     """The daemon's CAN port on an slcan adapter of memory."""
 
-    def __init__(self, line: MemoryPort, clock: Callable[[], int]) -> None:
+    def __init__(self, line: MemoryPort, bitrate_bps: int, clock: Callable[[], int]) -> None:
         self._line = line
-        super().__init__(interface="slcan", channel=line.name, clock=clock)
+        super().__init__(interface="slcan", channel=line.name, bitrate_bps=bitrate_bps, clock=clock)
 
     def _open(self, interface: str, channel: str, bitrate_bps: int) -> can.BusABC:
         return LawicelBus(channel, bitrate_bps=bitrate_bps, clock=self._clock, drops=self.drops, line=self._line)
