@@ -258,7 +258,8 @@ def _log_stage(options: argparse.Namespace, config: Table, now_ns: int) -> Stage
 
 def _publish(config: Table, folder: Path, name: str) -> None:
     """Print the configuration and put it into the folder, whole or not at all."""
-    config.setdefault("store", {}).setdefault("path", str(folder / f"{config['robot']['id']}-{name}.umfeld"))
+    robot = config.get("robot", {}).get("id", "robot")
+    config.setdefault("store", {}).setdefault("path", str(folder / f"{robot}-{name}.umfeld"))
     head = f"# Emulated devices of `umfeld sim` in {folder}; they are there as long as it runs.\n"
     head += f"# umfeld run --config {folder / 'umfeld.toml'}\n\n"
     text = head + to_toml(config)

@@ -142,6 +142,15 @@ def test_its_own_configuration_can_be_emulated_again(tmp_path: Path) -> None:
     assert again["can"]["main"]["channel"] == str(second / "can-main")
 
 
+def test_a_configuration_of_one_device_is_emulated(tmp_path: Path) -> None:
+    """As a device's page has it: without a robot, a drive or maps."""
+    config = tmp_path / "robot.toml"
+    config.write_text('[lasers.front]\ndriver = "ldrobot"\nport = "/dev/ttyUSB0"\n')
+    code, text, said = played("--dir", str(tmp_path / "sim"), "--config", str(config), "--duration", "0.5")
+    assert code == 0, said
+    assert load_text(text, tmp_path)["lasers"]["front"]["port"] == str(tmp_path / "sim" / "laser-front")
+
+
 def load_text(text: str, folder: Path) -> dict[str, dict[str, dict[str, object]]]:
     path = folder / "again.toml"
     path.write_text(text)
