@@ -58,7 +58,7 @@ BACKLOG_LIMIT = 1 << 20
 class Kind:
     """One kind of fault: what it hits, what its value means and what it is if none is given."""
 
-    hits: str  # what can have it: a wire, any device, a bus, a laser, sonar, encoder, or what a scene shows
+    hits: str  # what can have it: any device, a wire, serial port, bus, laser, sonar, encoder, or what a scene shows
     meaning: str
     value: float = 1.0
 
@@ -66,9 +66,9 @@ class Kind:
 KINDS: dict[str, Kind] = {
     # wires, and the nodes of a bus where that makes sense
     "unplug": Kind("any", "the plug is out; the device keeps its power"),
-    "rename": Kind("wire", "the port is gone and comes back under its name plus this number", 1),
-    "busy": Kind("wire", "another program holds the port"),
-    "no_permission": Kind("wire", "the port may not be opened"),
+    "rename": Kind("port", "the port is gone and comes back under its name plus this number", 1),
+    "busy": Kind("port", "another program holds the port"),
+    "no_permission": Kind("port", "the port may not be opened"),
     "power_cycle": Kind("any", "no supply; starts from scratch afterwards"),
     "brown_out": Kind(
         "any", "the supply dips in the middle of a message; silent for this many seconds, then starts", 0.3
@@ -82,7 +82,7 @@ KINDS: dict[str, Kind] = {
     "drop": Kind("any", "share of bytes (frames, on a bus) lost; to_device=1: of those the host sends", 0.01),
     "add": Kind("any", "share of bytes (frames, on a bus) followed by one too many; to_device=1 as above", 0.01),
     "flip": Kind("any", "share of bytes (frames, on a bus) with one bit turned; to_device=1 as above", 0.01),
-    "wrong_baud": Kind("wire", "the device runs at another line rate"),
+    "wrong_baud": Kind("port", "the device runs at another line rate"),
     "flood": Kind("any", "so many bytes (frames, on a bus) of nonsense a second", 2000),
     "delay": Kind("any", "everything arrives so many seconds late", 0.1),
     # a CAN bus
@@ -311,7 +311,7 @@ class FaultPlan:
                 found.append(f"{fault.target}:{fault.kind}: there is no device {fault.target!r}{hint}")
             elif not any(KINDS[fault.kind].hits in what for what in carried):
                 hint = f"it hits {KINDS[fault.kind].hits}, this has {', '.join(sorted(set().union(*carried)))}"
-                if KINDS[fault.kind].hits == "wire" and any("bus" in what for what in carried):
+                if KINDS[fault.kind].hits in ("wire", "port") and any("bus" in what for what in carried):
                     hint = f"the serial port of its adapter is adapter{fault.target.removeprefix('bus')}"
                 found.append(f"{fault.target}:{fault.kind}: {fault.target!r} cannot have this fault; {hint}")
         return found
@@ -327,9 +327,9 @@ class FaultPlan:
         self._carries(target, "scene", "beams", "cones", "wheels")
         return FaultyScene(scene, self, target)
 
-    def device(self, target: str, device: ByteDevice) -> FaultyByteDevice:
-        """A serial or TCP device with its faults."""
-        self._carries(target, "any", "wire", *_families(device))
+    def device(self, target: str, device: ByteDevice, *, on_network: bool = False) -> FaultyByteDevice:
+        """A serial or network device with its faults."""
+        self._carries(target, "any", "wire", *([] if on_network else ["port"]), *_families(device))
         return FaultyByteDevice(device, self, target)
 
     def node(self, target: str, node: CanDevice) -> FaultyNode:

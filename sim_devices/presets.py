@@ -180,7 +180,8 @@ class _Builder:
             on_tcp=on_tcp,
         )
         link = TcpLink(0) if on_tcp and not self.in_memory else self._line(f"laser-{name}")
-        self.attachment.add(f"lasers.{name}", self.plan.device(target, device) if self.faulty else device, link)
+        faulty = self.plan.device(target, device, on_network=on_tcp) if self.faulty else device
+        self.attachment.add(f"lasers.{name}", faulty, link)
         self.robot.lasers[name], self.robot.links[f"lasers.{name}"] = device, link
         if isinstance(link, TcpLink):
             laser["port"] = f"tcp://{link.host}:{link.port}"
@@ -363,7 +364,8 @@ class _Builder:
         if port.startswith("udpout") and isinstance(link, UdpLink):
             for table in tables:
                 table["port"] = f"udpout:{link.host}:{link.port}"
-        self.attachment.add(target, self.plan.device(target, pilot) if self.faulty else pilot, link)
+        faulty = self.plan.device(target, pilot, on_network=True) if self.faulty else pilot
+        self.attachment.add(target, faulty, link)
         self.robot.links[target] = link
 
     # -- wheels -------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 from typing import Any
@@ -237,3 +238,16 @@ def test_unknown_wheels_say_what_there_is(tmp_path: Path) -> None:
             emulate(config(driver="steam"), straight(), attachment, tmp_path)
     finally:
         attachment.stop()
+
+
+@pytest.mark.parametrize("fault", ["rename=1", "busy", "no_permission", "wrong_baud"])
+def test_what_only_a_serial_port_can_have_is_refused_on_a_network(tmp_path: Path, fault: str) -> None:
+    """It was taken, and did nothing."""
+    table = {"lasers": {"front": {"driver": "sick_cola", "port": "tcp://192.168.0.1:2112"}}}
+    for laser, refused in ((None, True), ("utm-30lx", False)):
+        plan = FaultPlan([f"laser:{fault}"])
+        attachment = Attachment(clock=lambda: 0)
+        emulate(copy.deepcopy(table), straight(), attachment, tmp_path, laser=laser, plan=plan, in_memory=True)
+        attachment.stop()
+        assert bool(plan.complaints()) is refused
+        assert all("it hits port" in each for each in plan.complaints())
