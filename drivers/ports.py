@@ -355,6 +355,9 @@ class CanPort:
 
     def write(self, item: CanFrame) -> None:
         """Send one frame. A full transmit queue (nobody acknowledges) loses it and counts `tx_full`."""
+        if (slcan := self._slcan) is not None:
+            self._guarded(lambda: slcan.put(item))
+            return
         message = self._can.Message(
             arbitration_id=item.can_id,
             is_extended_id=item.extended,

@@ -41,6 +41,7 @@ _HEX = re.compile(rb"[0-9A-Fa-f]*")
 _LONGEST_LINE = 64  # a frame needs at most 30 characters
 _REFUSALS = 8  # so many BELs in a row, and nothing else heard: the adapter is closed or bus-off
 _MOST_QUEUED = 10_000
+_READS_MAX = 4
 
 
 class Line(Port[bytes], Protocol):
@@ -77,6 +78,7 @@ class LawicelBus(can.BusABC):
         self.drops = drops if drops is not None else {}
         self.channel_info = f"slcan on {path}"
         speed = int(baud) if baud.isdigit() else 115200
+        self._clock = clock
         self._line: Line = SerialPort(path, baud=speed, clock=clock) if line is None else line
         self._buffer = bytearray()
         self._frames: deque[tuple[CanFrame, int]] = deque()
@@ -115,11 +117,27 @@ class LawicelBus(can.BusABC):
         return _message_of(*frames[0]) if frames else None
 
     def frames(self, timeout_s: float, most: int) -> list[tuple[CanFrame, int]]:
-        """Up to `most` frames with their arrival times, as our drivers take them; reads the line once at most."""
-        if not self._frames:
-            for chunk, stamp_ns in self._line.read(timeout_s):
+        """Up to `most` frames with their arrival times, as our drivers take them.
+
+        The adapter's answers and beginnings of lines do not end the wait, up to a few of them: each would cost the
+        reader a turn, and after every frame sent there is an answer.
+        """
+        left_s, end_ns = timeout_s, self._clock() + round(timeout_s * 1e9)
+        for _ in range(_READS_MAX):
+            if self._frames:
+                break
+            chunks = self._line.read(left_s)
+            for chunk, stamp_ns in chunks:
                 self._take(chunk, stamp_ns)
+            left_s = (end_ns - self._clock()) / 1e9
+            if not chunks or left_s <= 0.0:
+                break
         return [self._frames.popleft() for _ in range(min(most, len(self._frames)))]
+
+    def put(self, frame: CanFrame) -> None:
+        """Send one frame of ours, without the detour over a can.Message; as send() otherwise."""
+        length = frame.dlc if frame.remote and frame.dlc is not None else len(frame.data)
+        self._line.write(encode_line(frame.can_id, frame.data, frame.extended, frame.remote, length))
 
     def _take(self, chunk: bytes, stamp_ns: int) -> None:
         self._buffer += chunk

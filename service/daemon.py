@@ -68,7 +68,7 @@ _FUSION_STOP_S = 2.0
 _PUBLISHER_STOP_S = 2.0
 _MAVLINK_STOP_S = 1.0
 _GIVE_BACK_AT_S = (1, 6)  # the makers of maps load theirs with the first sweeps
-_GIL_SWITCH_S = 0.001  # a scan passes through three threads; by default each may wait 5 ms for the one that computes
+_GIL_SWITCH_S = 0.0002  # a scan takes the lock some six times; by default each may wait 5 ms for the one that computes
 
 
 class Daemon:

@@ -11,6 +11,7 @@ from mapping.grids.patch import GridPatch
 from mapping.localise.in_map import MapLocaliser
 from mapping.localise.kept_sweeps import kept_sweep
 from mapping.localise.known_map import known_map, points_of
+from mapping.localise.pose_graph import Edges, optimise
 from mapping.localise.scan_match import agreement, match_view
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.slam import Slam, SlamSettings
@@ -20,7 +21,11 @@ from mapping.scan import Scan
 
 
 def warm_up() -> None:
-    """Drive past two walls and back, in numbers that are thrown away; one search, one optimisation."""
+    """Drive past two walls and back, in numbers that are thrown away; one search, one optimisation.
+
+    That also loads the solver of the pose graph: with the first closure of a drive, its import would hold all threads
+    up for a tenth of a second and more.
+    """
     bearing = np.linspace(-math.pi, math.pi, 90, endpoint=False)
     slam = Slam(SlamSettings(work_keys=2, lag_s=0.0, lag_s_per_key=0.0))
     for step in range(6):
@@ -41,6 +46,8 @@ def warm_up() -> None:
         raster = raster_of(snapshot.views, rows, snapshot.poses, window_m=window_m)
         find_view(view, raster, Pose2(), window_m=window_m, turn_rad=0.1)
     slam.finish()
+    there, back = np.array([0, 1]), np.array([1, 0])
+    optimise(np.zeros((2, 3)), Edges(there, back, np.zeros((2, 3)), np.array([np.eye(3)] * 2), np.array([False, True])))
     for _ in range(2):  # sweeps of the daemon share their bearings, which nobody may write: another kind of array
         is_changed(scan, depths_of(scan, table_for(bearing)), np.zeros((len(bearing), 3)), Pose2())
         bearing.setflags(write=False)

@@ -383,6 +383,84 @@ def test_slcan_serves_other_users_of_the_bus(pty: Pty) -> None:
     bus.shutdown()
 
 
+class ScriptedLine:
+    """A line that hands out one chunk a read, each after so many milliseconds of a clock of its own."""
+
+    name = "scripted"
+    silence_reopen_s = None
+
+    def __init__(self, chunks: list[tuple[int, bytes]]) -> None:
+        self.chunks = chunks
+        self.now_ns = 0
+        self.waits_s: list[float] = []
+        self.written = b""
+        self.drops: dict[str, int] = {}
+
+    def read(self, timeout_s: float) -> list[tuple[bytes, int]]:
+        self.waits_s.append(timeout_s)
+        if not self.chunks or self.chunks[0][0] * 1_000_000 > timeout_s * 1e9:
+            self.now_ns += round(timeout_s * 1e9)
+            return []
+        after_ms, chunk = self.chunks.pop(0)
+        self.now_ns += after_ms * 1_000_000
+        return [(chunk, self.now_ns)]
+
+    def write(self, item: bytes) -> None:
+        self.written += item
+
+    def set_baud(self, bits_per_s: int) -> None: ...
+
+    def discard_input(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def fileno(self) -> int | None:
+        return None
+
+
+def test_slcan_answers_and_halves_of_lines_do_not_end_the_wait() -> None:
+    line = ScriptedLine([(1, b"z\r"), (2, b"t123"), (3, b"0\rt1240\r")])
+    bus = LawicelBus("nowhere", bitrate_bps=1_000_000, clock=lambda: line.now_ns, line=line)
+    assert bus.frames(0.020, 10) == [(CanFrame(0x123), 6_000_000), (CanFrame(0x124), 6_000_000)]
+    assert line.waits_s == pytest.approx([0.020, 0.019, 0.017])
+    line.chunks = [(1, b"z\r"), (100, b"t1230\r")]
+    assert bus.frames(0.020, 10) == []
+    assert line.now_ns == 26_000_000  # not a moment longer than asked for
+    bus.shutdown()
+
+
+def test_slcan_noise_that_never_ends_gives_the_reader_its_turn() -> None:
+    line = ScriptedLine([(0, b"?\r")] * 100)
+    bus = LawicelBus("nowhere", bitrate_bps=1_000_000, clock=lambda: line.now_ns, line=line)
+    assert bus.frames(0.020, 10) == []
+    assert len(line.chunks) > 90
+    bus.shutdown()
+
+
+def test_slcan_sends_our_frames_as_it_sends_messages() -> None:
+    line = ScriptedLine([])
+    bus = LawicelBus("nowhere", bitrate_bps=1_000_000, clock=lambda: line.now_ns, line=line)
+    frames = [
+        CanFrame(0x080),
+        CanFrame(0x601, bytes(range(8))),
+        CanFrame(0x1ABCDEF0, b"\xab", extended=True),
+        CanFrame(0x321, remote=True, dlc=4),
+    ]
+    line.written = b""
+    for frame in frames:
+        bus.put(frame)
+    ours, line.written = line.written, b""
+    for frame in frames:
+        bus.send(
+            can.Message(
+                arbitration_id=frame.can_id, data=None if frame.remote else frame.data, is_extended_id=frame.extended,
+                is_remote_frame=frame.remote, dlc=frame.dlc if frame.dlc is not None else len(frame.data),
+            )
+        )  # fmt: skip
+    assert ours == line.written == b"t0800\rt60180001020304050607\rT1ABCDEF01AB\rr3214\r"
+    bus.shutdown()
+
+
 def test_slcan_endless_line_needs_no_memory(pty: Pty) -> None:
     port = CanPort(interface="slcan", channel=pty.path, clock=CLOCK)
     for _ in range(10):
