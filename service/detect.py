@@ -348,11 +348,12 @@ def find_by_serial(serial: str, *, driver: str, search: Sequence[str], now_ns: C
 
 
 def ports_like(search: Sequence[str]) -> list[str]:
-    """Ports that match any of the patterns, each device once, under the first name found."""
+    """What matches any of the patterns, each port once, under the first name found. Files and folders are none."""
     found: dict[str, str] = {}
     for pattern in search:
         for name in sorted(glob.glob(pattern)):
-            found.setdefault(os.path.realpath(name), name)
+            if not os.path.isfile(name) and not os.path.isdir(name):
+                found.setdefault(os.path.realpath(name), name)
     return list(found.values())
 
 

@@ -64,7 +64,8 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Example: umfeld sim --preset artos --world flat --fault laser:unplug@20s+2s",
     )
     add = parser.add_argument
-    add("--preset", default=None, help=f"the robot: {', '.join(PRESETS)} (the default)")
+    first, *others = PRESETS
+    add("--preset", default=None, help=f"the robot: {first} (the default), {', '.join(others)}")
     add("--config", type=Path, help="emulate the devices of this configuration instead of a preset's")
     add("--world", default="flat", help=f"floor plan: {', '.join(world_names())}, or a .toml file")
     add("--log", type=Path, help="play this recorded log instead of a world")

@@ -33,7 +33,11 @@ def sim(
         typer.Option(help="Model of the lasers: utm-30lx (default), lms200, rplidar-a1, ld06, tim571, ..."),
     ] = None,
     fault: Annotated[
-        list[str] | None, typer.Option(help="What goes wrong, for example laser:unplug@20s+2s; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            help="What goes wrong, for example laser:unplug@20s+2s; may be repeated. docs/faults.md explains all "
+            "kinds; a wrong one lists them."
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of noise, faults, slip and people.")] = None,
     slip: Annotated[float | None, typer.Option(help="Random wheel slip in m after one metre.")] = None,

@@ -13,7 +13,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from drivers.readings import Identity
 from service.commands.devices import _as_toml
 from service.config import load
-from service.detect import PROBES, Detected, Probe
+from service.detect import PROBES, Detected, Probe, ports_like
 from service.device_list import can_interfaces, permission_trouble, serial_ports
 
 
@@ -29,6 +29,20 @@ def test_tables_that_detect_prints_are_a_configuration(probe: Probe, serial: str
     assert (device is None) == (probe.section == "can")
     if probe.driver in ("arduino-bridge", "roboclaw", "mavlink"):  # which do not look for the speed
         assert getattr(device, "baud_bps", None) == 115200
+
+
+def test_files_beside_ports_are_not_asked(tmp_path: Path) -> None:
+    """A pattern over the folder of emulated devices: their configuration lies beside them."""
+    master, slave = pty.openpty()
+    (tmp_path / "laser-front").symlink_to(os.ttyname(slave))
+    (tmp_path / "umfeld.toml").touch()
+    (tmp_path / "recordings").mkdir()
+    try:
+        assert ports_like([f"{tmp_path}/*"]) == [f"{tmp_path}/laser-front"]
+        assert ports_like([f"{tmp_path}/umfeld.toml"]) == []
+    finally:
+        os.close(master)
+        os.close(slave)
 
 
 def test_a_port_is_shown_by_the_name_that_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
