@@ -32,6 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 SCAN_PERIOD_S = 0.025
+SWEEP_NS = 20_000_000  # from the first beam to the last byte: 19 ms of turning, and the line
 WARM_UP_S = 4.0
 
 
@@ -122,19 +123,21 @@ def latencies_ms(ends_ns: Sequence[int], samples: Sequence[tuple[int, int]]) -> 
     """For each scan that reached the subscriber: from its last byte on the wire to its sector map.
 
     samples: (came, first beam of the scan behind it). A map sent again without a new scan has the same first beam. The
-    scan's last byte is the first end of a scan at least 10 ms after its first beam: a sweep takes 19 ms.
+    scan's last byte is the end of a scan that lies nearest to a sweep after its first beam, so the fit of the laser's
+    clock may be off by nearly half a period either way; no end counts twice.
     """
     found: list[float] = []
-    last_beam_ns = 0
-    at = 0
+    last_beam_ns, at, used = 0, 0, -1
     for came_ns, beam_ns in samples:
         if beam_ns - last_beam_ns < SCAN_PERIOD_S * 1e9 / 2:
             continue
         last_beam_ns = beam_ns
-        while at < len(ends_ns) and ends_ns[at] < beam_ns + 10_000_000:
+        wanted_ns = beam_ns + SWEEP_NS
+        while at + 1 < len(ends_ns) and abs(ends_ns[at + 1] - wanted_ns) <= abs(ends_ns[at] - wanted_ns):
             at += 1
-        if at < len(ends_ns) and ends_ns[at] <= came_ns:
+        if at < len(ends_ns) and at != used and ends_ns[at] <= came_ns:
             found.append((came_ns - ends_ns[at]) / 1e6)
+            used = at
     return found
 
 

@@ -172,6 +172,12 @@ def is_nothing(range_m: float) -> bool:
     return math.isnan(range_m) or (math.isfinite(range_m) and range_m < 0.0)
 
 
+def echo_and_free(range_m: float, range_min_m: float, range_max_m: float, free_share: float) -> tuple[float, float]:
+    """Where a sonar's echo came from, inf if there was none, and how far its cone is free."""
+    echo_m = range_min_m if math.isinf(range_m) and range_m < 0.0 else range_m
+    return echo_m, 0.0 if echo_m <= range_min_m else free_share * min(echo_m, range_max_m)
+
+
 def see_cone(
     range_m: float,
     *,
@@ -182,8 +188,7 @@ def see_cone(
     virtual_from_transducer: Pose2,
 ) -> tuple[Sight, F64, F64]:
     """What a sonar has seen: its star, the (M, 2) arc the echo came from (empty: no echo), and (M,) angles off axis."""
-    echo_m = range_min_m if math.isinf(range_m) and range_m < 0.0 else range_m
-    free_m = 0.0 if echo_m <= range_min_m else free_share * min(echo_m, range_max_m)
+    echo_m, free_m = echo_and_free(range_m, range_min_m, range_max_m, free_share)
     sight = sight_of_cone(
         cone_rad=cone_rad,
         free_m=free_m,

@@ -9,17 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.frames import IDENTITY, Pose2
+from mapping.kernels import sector_cones as cones
 from mapping.kernels import sectors as kernels
 from mapping.sectors.evidence import Evidence, Finding, blind_finding
 from mapping.sectors.footprint import Outline, checked_polygon
 from mapping.sectors.inputs import (
     FanReader,
     cones_remembered,
+    echo_and_free,
     is_nothing,
-    see_cone,
     touched_line,
 )
-from mapping.sectors.sight import Sight, arc_of_cone
+from mapping.sectors.sight import LEAST_RANGE_M, Sight, arc_directions, arc_of_cone, cone_pieces
 from mapping.sectors.snapshot import PolarSnapshot, SectorState
 
 F64 = NDArray[np.float64]
@@ -150,18 +151,9 @@ class PolarSectors:
     def _find_in_cone(
         self, pose: Pose2, cone_rad: float, range_m: float, range_min_m: float, range_max_m: float
     ) -> Finding:
-        sight, arc, off_axis = see_cone(
-            range_m,
-            cone_rad=cone_rad,
-            range_min_m=range_min_m,
-            range_max_m=range_max_m,
-            free_share=self._cone_free_share,
-            virtual_from_transducer=pose,
-        )
-        nearest_m, at_rad = self._frame.nearest_of_arc(arc, off_axis)
-        free_m = self._frame.free(sight)
-        free_m[~self._frame.ends_in_cone(free_m, cone_rad, pose)] = 0.0
-        return Finding(nearest_m, at_rad, at_rad, free_m, np.zeros(len(free_m), dtype=bool))
+        echo_m, free_m = echo_and_free(range_m, range_min_m, range_max_m, self._cone_free_share)
+        nearest_m, at_rad, all_free_m = self._frame.of_cone(pose, cone_rad, echo_m, free_m, range_min_m)
+        return Finding(nearest_m, at_rad, at_rad, all_free_m, np.zeros(len(all_free_m), dtype=bool))
 
     def update_contact(
         self,
@@ -232,12 +224,21 @@ class _Wedges:
         distance, bearing = kernels.nearest_in_sectors(x, y, self._edges, self._width, self._range_max_m)
         return distance, bearing
 
-    def nearest_of_arc(self, arc: F64, off_axis: F64) -> tuple[F64, F64]:
-        """(N,) least distance of an arc in each sector, and the bearing of its point nearest to the axis."""
-        distance, bearing = kernels.arc_in_sectors(
-            np.ascontiguousarray(arc), off_axis, self._edges, self._width, self._range_max_m
-        )
-        return distance, bearing
+    def of_cone(
+        self, virtual_from_transducer: Pose2, cone_rad: float, echo_m: float, free_m: float, near_m: float
+    ) -> tuple[F64, F64, F64]:
+        """(N,) least distance of an echo's arc, the bearing of its point nearest to the axis, and up to which all of a
+        sector is free and its far corners lie within the cone. near_m: up to which the whole front is free, if free_m
+        is above 0 (see sight_of_cone).
+        """
+        pose = virtual_from_transducer
+        pieces, near_m = cone_pieces(cone_rad, near_m if free_m > 0.0 else 0.0)
+        nearest, at, free = cones.cone_in_sectors(
+            pose.x_m, pose.y_m, pose.yaw_rad, 0.5 * cone_rad, free_m, near_m, max(echo_m, LEAST_RANGE_M), *pieces,
+            *arc_directions(cone_rad), self._edges, self._width, self._range_max_m, self.border_m, self._begins,
+            self._body, self._reach_m,
+        )  # fmt: skip
+        return nearest, at, free
 
     def free(self, sight: Sight) -> F64:
         """(N,) up to which all of each sector, but for the vehicle itself, lies in what was seen; 0 if nothing does."""
@@ -267,15 +268,6 @@ class _Wedges:
         )
         bearing = kernels.arc_in_sectors(np.ascontiguousarray(arc), off_axis, self._edges, self._width, math.inf)[1]
         return np.asarray(np.isfinite(bearing))
-
-    def ends_in_cone(self, distance_m: F64, cone_rad: float, virtual_from_transducer: Pose2) -> Bool:
-        """(N,) whether the far corners of each sector, cut off at a distance, lie within a cone."""
-        transducer_from_virtual = virtual_from_transducer.inverse()
-        inside = distance_m > 0.0
-        for edge in (self._edges[:-1], self._edges[1:]):
-            corner = transducer_from_virtual.apply(_points(distance_m, edge))
-            inside &= np.abs(np.arctan2(corner[:, 1], corner[:, 0])) <= 0.5 * cone_rad + 1e-9
-        return np.asarray(inside)
 
 
 def _points(distance_m: F64, bearing_rad: F64) -> F64:

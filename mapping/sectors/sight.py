@@ -26,7 +26,7 @@ _SAME_PLACE_M = 1e-9
 _CONE_STEP_RAD = math.radians(2.0)
 _ARC_STEP_RAD = math.radians(0.5)
 _FRONT_RAD = math.radians(100.0)  # a little more than half the front, so that a flush bumper leaves no seam
-_LEAST_RANGE_M = 1e-6  # an obstacle at range zero still has a bearing
+LEAST_RANGE_M = 1e-6  # an obstacle at range zero still has a bearing
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,8 @@ def median_spacing(bearing_rad: F64) -> float | None:
     middle = len(gaps) // 2
     if len(gaps) % 2:
         return float(np.partition(gaps, middle)[middle])
-    return float(np.partition(gaps, [middle - 1, middle])[middle - 1 : middle + 1].mean())
+    lower, upper = np.partition(gaps, [middle - 1, middle])[middle - 1 : middle + 1].tolist()
+    return float(0.5 * (lower + upper))
 
 
 def star_of_beams(bearing_rad: F64, range_m: F64, *, range_max_m: float, spacing_rad: float) -> Star:
@@ -115,11 +116,18 @@ def sight_of_cone(*, cone_rad: float, free_m: float, near_m: float, virtual_from
     wave of the transducer's size there, not yet a cone.
     """
     half = 0.5 * cone_rad
-    with_front = near_m > 0.0 and half < _FRONT_RAD
-    lo, hi, ahead = _cone_pieces(cone_rad, with_front)
-    length = np.where(ahead, max(free_m, near_m) if with_front else free_m, near_m)
+    (lo, hi, ahead), near_m = cone_pieces(cone_rad, near_m)
+    length = np.where(ahead, max(free_m, near_m), near_m)
     sees = (length > 0.0) & np.isfinite(length)
     return Sight(virtual_from_transducer, Star(lo[sees], hi[sees], length[sees], np.array([-half]), np.array([half])))
+
+
+def cone_pieces(cone_rad: float, near_m: float) -> tuple[tuple[F64, F64, Bool], float]:
+    """Thin sectors (M,) of a cone and, with near_m above 0, of everything ahead: lo, hi, which of them are the cone's.
+    And near_m, 0 where the cone is as wide as all that.
+    """
+    with_front = near_m > 0.0 and 0.5 * cone_rad < _FRONT_RAD
+    return _cone_pieces(cone_rad, with_front), near_m if with_front else 0.0
 
 
 @lru_cache(64)
@@ -140,7 +148,7 @@ def _cone_pieces(cone_rad: float, with_front: bool) -> tuple[F64, F64, Bool]:
 
 
 @lru_cache(64)
-def _arc_directions(cone_rad: float) -> tuple[F64, F64, F64]:
+def arc_directions(cone_rad: float) -> tuple[F64, F64, F64]:
     """(M,) angles off the axis along an arc, their cosines and sines."""
     half_steps = max(1, math.ceil(0.5 * cone_rad / _ARC_STEP_RAD))
     off = np.linspace(-0.5 * cone_rad, 0.5 * cone_rad, 2 * half_steps + 1)
@@ -150,14 +158,14 @@ def _arc_directions(cone_rad: float) -> tuple[F64, F64, F64]:
 def end_points(bearing_rad: F64, range_m: F64, *, range_min_m: float, virtual_from_sensor: Pose2) -> F64:
     """(M, 2) obstacles of a fan of beams, virtual sensor frame; what is too close stands at range_min_m."""
     pose = virtual_from_sensor
-    points: F64 = kernels.beam_ends(bearing_rad, range_m, range_min_m, _LEAST_RANGE_M, pose.x_m, pose.y_m, pose.yaw_rad)
+    points: F64 = kernels.beam_ends(bearing_rad, range_m, range_min_m, LEAST_RANGE_M, pose.x_m, pose.y_m, pose.yaw_rad)
     return points
 
 
 def arc_of_cone(*, cone_rad: float, range_m: float, virtual_from_transducer: Pose2) -> tuple[F64, F64]:
     """(M, 2) points along the arc an echo may have come from, and (M,) how far each is off the axis, in radians."""
-    off_axis, c, s = _arc_directions(cone_rad)
-    r = max(range_m, _LEAST_RANGE_M)
+    off_axis, c, s = arc_directions(cone_rad)
+    r = max(range_m, LEAST_RANGE_M)
     points = np.empty((len(off_axis), 2))
     points[:, 0], points[:, 1] = r * c, r * s
     return virtual_from_transducer.apply(points), off_axis

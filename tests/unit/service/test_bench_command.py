@@ -42,6 +42,20 @@ def test_a_map_sent_again_is_not_a_scan_and_a_lost_scan_is_no_latency(latency: o
     assert latency.latencies_ms(ends, samples) == pytest.approx([3.0, 5.0])  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize("off_ns", [-11_000_000, -5_000_000, 11_000_000])
+def test_a_fit_of_the_clock_that_is_off_moves_no_scan_to_another(latency: object, off_ns: int) -> None:
+    began, ends = scans(50)
+    samples = [(end + 2_000_000, stamp + off_ns * min(k, 10) // 10) for k, (end, stamp) in enumerate(zip(ends, began))]
+    found = latency.latencies_ms(ends, samples)  # type: ignore[attr-defined]
+    assert found == pytest.approx([2.0] * 50)
+
+
+def test_no_last_byte_counts_twice(latency: object) -> None:
+    began, ends = scans(3)
+    samples = [(ends[0] + 2_000_000, began[0]), (ends[0] + 9_000_000, began[0] + 12_600_000)]
+    assert latency.latencies_ms(ends, samples) == pytest.approx([2.0])  # type: ignore[attr-defined]
+
+
 def test_percentiles_are_of_what_was_measured(latency: object) -> None:
     values = [float(v) for v in range(1, 101)]
     assert latency.percentile(values, 0.5) == 51.0  # type: ignore[attr-defined]
