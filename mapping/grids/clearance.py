@@ -34,10 +34,10 @@ def clearance_of_cell_size(resolution_m: float) -> float:
     return check_resolution(resolution_m) * math.sqrt(2.0)
 
 
-def squared_cell_distances(obstacle: Bools) -> I32:
+def squared_cell_distances(obstacle: ArrayLike) -> I32:
     """(R, C) exact squared distance, in cells, from each cell's centre to the nearest obstacle cell's centre.
 
-    obstacle: (R, C).  kernels.FAR where there is no obstacle at all.  Time grows as R * C.
+    obstacle: (R, C), anything but 0 is one.  kernels.FAR where there is no obstacle at all.  Time grows as R * C.
     Raises ValueError if it is not (R, C) or has a side above 20,000.
     """
     return DistanceField(obstacle).squared
@@ -55,16 +55,17 @@ class DistanceField:
     Raises ValueError if obstacle is not (R, C) or has a side above 20,000, or for a reach below 0.
     """
 
-    def __init__(self, obstacle: Bools, *, reach_cells: int | None = None) -> None:
+    def __init__(self, obstacle: ArrayLike, *, reach_cells: int | None = None) -> None:
         if reach_cells is not None and reach_cells < 0:
             raise ValueError(f"reach_cells is a number of cells, got {reach_cells}")
-        if obstacle.ndim != 2 or max(obstacle.shape) > MAX_SIDE_CELLS:
-            raise ValueError(f"obstacles are (R, C) with sides up to {MAX_SIDE_CELLS}, got {obstacle.shape}")
-        rows, cols = obstacle.shape
+        given = np.asarray(obstacle)
+        if given.ndim != 2 or max(given.shape) > MAX_SIDE_CELLS:
+            raise ValueError(f"obstacles are (R, C) with sides up to {MAX_SIDE_CELLS}, got {given.shape}")
+        rows, cols = given.shape
         self.shape = (rows, cols)
         self.squared: I32 = np.empty((rows, cols), dtype=np.int32)
         self.site: I32 = np.empty((rows, cols), dtype=np.int32)
-        self._obstacle = obstacle.astype(np.uint8)
+        self._obstacle: NDArray[np.uint8] = (given != 0).astype(np.uint8)  # NaN is one, too
         self._reach = kernels.UNLIMITED if reach_cells is None else min(int(reach_cells), kernels.UNLIMITED)
         self._half = clearance_reach.half_widths(self._reach) if self._reach < kernels.UNLIMITED else None
         self._nearest: NDArray[np.int16] | None = None

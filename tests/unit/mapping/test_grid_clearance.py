@@ -172,6 +172,17 @@ def test_a_cell_that_comes_and_goes_at_once_stays() -> None:
         assert np.array_equal(field.site, DistanceField(mask, reach_cells=reach).site)
 
 
+def test_anything_but_nothing_is_an_obstacle() -> None:
+    given = [[0.0, 0.0, 7.0], [0.0, 0.0, 0.0], [0.0, math.nan, 0.0]]
+    mask = np.array(given) != 0.0
+    for reach in (None, 5):
+        field = DistanceField(given, reach_cells=reach)
+        assert np.array_equal(field.obstacle, mask)
+        field.update([(0, 0)], [(0, 2)])
+        assert field.squared.tolist() == [[0, 1, 4], [1, 1, 2], [1, 0, 1]]
+    assert squared_cell_distances(given)[0].tolist() == [4, 1, 0]
+
+
 def test_a_reach_below_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="reach"):
         DistanceField(np.eye(3, dtype=np.bool_), reach_cells=-1)
