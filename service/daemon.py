@@ -65,6 +65,8 @@ log = logging.getLogger(__name__)
 EXIT_DEADLINE_S = 8.0  # systemd would kill after 10
 _WIRE_STOP_S = 1.5
 _FUSION_STOP_S = 2.0
+_MAKERS_STOP_S = 4.0  # a turn of theirs may be rooms of a large map, and the computer slow
+_BACKGROUND_STOP_S = 0.5
 _PUBLISHER_STOP_S = 2.0
 _MAVLINK_STOP_S = 1.0
 _GIVE_BACK_AT_S = (1, 6)  # the makers of maps load theirs with the first sweeps
@@ -370,19 +372,19 @@ class Daemon:
         """All at once: a wire that hangs must not keep the others' lasers on."""
 
         def stop(reader: WireReader[Any]) -> None:
-            self._note(reader.stop(_WIRE_STOP_S))
+            self._note(f"wire {reader.name}", reader.stop(_WIRE_STOP_S))
 
         for wait in [_Beside(f"stop {reader.name}", partial(stop, reader)) for reader in self._readers]:
             wait()
 
     def _stop_worker(self) -> None:
-        self._note(self._worker.stop(_FUSION_STOP_S))
+        self._note("fusion", self._worker.stop(_FUSION_STOP_S))
 
     def _stop_makers(self) -> None:
-        self._note(self._makers.stop(_FUSION_STOP_S))
+        self._note("the making of maps", self._makers.stop(_MAKERS_STOP_S))
 
     def _stop_background(self, background: Background) -> None:
-        self._note(background.stop(_FUSION_STOP_S))
+        background.stop(_BACKGROUND_STOP_S)  # what it works out nobody takes any more: it may end in the midst of it
 
     def _finish_map(self, live_map: LiveMap) -> None:
         try:
@@ -392,9 +394,11 @@ class Daemon:
             self._clean = False
 
     def _close_publisher(self) -> None:
-        self._note(self._publisher.close(_PUBLISHER_STOP_S))
+        self._note("publishing", self._publisher.close(_PUBLISHER_STOP_S))
 
-    def _note(self, in_time: bool) -> None:
+    def _note(self, what: str, in_time: bool) -> None:
+        if not in_time:
+            log.error("%s did not end within its time and is left behind: the exit code is 1", what)
         self._clean = self._clean and in_time
 
 

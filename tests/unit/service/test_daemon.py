@@ -32,7 +32,7 @@ from service.sensors import Laser
 from service.store import MapStore, occupancy_patch
 from service.systemd import Notifier
 from service.worker import Worker
-from tests.waiting import GIVE_UP_S
+from tests.waiting import GIVE_UP_S, free_port
 
 SECOND = 1_000_000_000
 
@@ -478,6 +478,29 @@ def test_the_router_is_set_up_as_configured() -> None:
     assert settings.tls is not None
     assert (settings.tls.root_ca_certificate, settings.tls.private_key, settings.tls.mutual) == ("a", "c", True)
     assert settings.zenoh_config == Path.home() / "zenoh.json5"
+
+
+def test_what_does_not_end_in_time_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The exit code alone said that something was late."""
+    from service.config import load
+
+    file = tmp_path / "umfeld.toml"
+    file.write_text(f'[network]\nlisten = ["tcp/127.0.0.1:{free_port()}"]\n[store]\nenabled = false\n')
+    daemon = Daemon(load(file, environment={}))
+    daemon.start()
+    publisher = daemon._publisher
+    assert publisher is not None
+    close = publisher.close
+
+    def late(deadline_s: float) -> bool:
+        close(GIVE_UP_S)
+        return False
+
+    monkeypatch.setattr(publisher, "close", late)
+    assert not daemon.stop()
+    assert "publishing did not end within its time" in caplog.text
 
 
 def test_a_start_that_fails_gives_everything_back(tmp_path: Path) -> None:
