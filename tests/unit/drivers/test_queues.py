@@ -5,15 +5,16 @@ from __future__ import annotations
 import threading
 
 from drivers.queues import BoundedQueue
+from tests.waiting import GIVE_UP_S
 
 
 def test_who_waits_is_woken() -> None:
     queue: BoundedQueue[int] = BoundedQueue(10)
     got: list[tuple[str, int]] = []
-    waiter = threading.Thread(target=lambda: got.extend(queue.get_all(30.0)))
+    waiter = threading.Thread(target=lambda: got.extend(queue.get_all(GIVE_UP_S)))
     waiter.start()
     queue.put("a", 1)
-    waiter.join(10.0)
+    waiter.join(GIVE_UP_S)
     assert not waiter.is_alive()
     assert got == [("a", 1)]
 
@@ -34,7 +35,7 @@ def test_nothing_is_lost_and_no_ring_is_left_over_around_time_outs() -> None:
     got: list[int] = []
     while len(got) < count:
         got.extend(item for _, item in queue.get_all(0.0001))
-    putter.join(10.0)
+    putter.join(GIVE_UP_S)
     assert got == list(range(count))
     assert queue.get_all(0.01) == []
     assert queue.get(0.01) is None

@@ -15,6 +15,7 @@ from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service.map_makers import SWEEPS_WAITING_MAX, MapMakers, MapView, SweepTap, Tile
 from service.outputs import DocumentOut, GridOut, GridUpdateOut, Output, PoseOut
+from tests.waiting import GIVE_UP_S
 
 F64 = NDArray[np.float64]
 SECOND = 1_000_000_000
@@ -181,5 +182,5 @@ def test_questions_are_answered_by_the_thread_and_errors_go_to_who_asked() -> No
         with pytest.raises(ZeroDivisionError):
             makers.ask(lambda: 1 // 0)
     finally:
-        assert makers.stop(5.0)
+        assert makers.stop(GIVE_UP_S)
     assert makers.ask(lambda: 6) == 6  # nobody is left to disturb

@@ -24,6 +24,7 @@ from service.layers import BuildingLayer, RollingLayer, insert_sweep
 from service.redraw import DELAY_NS, DELAY_NS_PER_KEPT, KeptRound, Redrawer
 from service.sensors import Switch
 from service.slam_store import _kept_of, _kept_tile, _unpack
+from tests.waiting import GIVE_UP_S
 
 F64 = NDArray[np.float64]
 T = TypeVar("T")
@@ -256,6 +257,6 @@ def test_ranges_come_back_to_a_millimetre_and_never_longer_than_seen(ranges: lis
 def test_threads_beside_do_what_is_submitted_and_end() -> None:
     background = Background(threads=2)
     futures = [background.submit(lambda k=k: 10 // k) for k in (1, 2, 0)]  # type: ignore[misc]
-    assert [futures[0].result(5.0), futures[1].result(5.0)] == [10, 5]
-    assert isinstance(futures[2].exception(5.0), ZeroDivisionError)
-    assert background.stop(5.0)
+    assert [futures[0].result(GIVE_UP_S), futures[1].result(GIVE_UP_S)] == [10, 5]
+    assert isinstance(futures[2].exception(GIVE_UP_S), ZeroDivisionError)
+    assert background.stop(GIVE_UP_S)
