@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 import random
+import socket
 from typing import Any
 
 import pytest
@@ -36,6 +37,7 @@ from drivers.readings import (
     WheelReading,
 )
 from drivers.udp_port import UdpPort, parse_udp
+from tests.waiting import free_port
 
 MS = 1_000_000
 
@@ -330,7 +332,7 @@ def test_any_bytes_raise_nothing(chunks: list[bytes]) -> None:
 
 def test_datagrams_go_both_ways_and_only_to_this_machine() -> None:
     now = iter(range(1_000_000))
-    listening = UdpPort(f"udpin:127.0.0.1:{free_port()}", clock=lambda: next(now))
+    listening = UdpPort(f"udpin:127.0.0.1:{free_port(socket.SOCK_DGRAM)}", clock=lambda: next(now))
     sending = UdpPort(listening.name.replace("udpin", "udpout"), clock=lambda: next(now))
     try:
         listening.write(b"to nobody yet")
@@ -347,14 +349,6 @@ def test_datagrams_go_both_ways_and_only_to_this_machine() -> None:
     finally:
         listening.close()
         sending.close()
-
-
-def free_port() -> int:
-    import socket
-
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def test_udp_addresses() -> None:

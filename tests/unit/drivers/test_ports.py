@@ -20,7 +20,7 @@ from drivers.conversation import CanFrame
 from drivers.errors import PortAbsent, PortBusy, PortDenied, PortError
 from drivers.ports import CanPort, SerialPort, TcpPort, _opening_failed
 from drivers.slcan_bus import LawicelBus, decode_line, encode_line
-from tests.waiting import GIVE_UP_S, SteadyClock, seconds_of, wait_for, wait_for_input
+from tests.waiting import GIVE_UP_S, SteadyClock, free_port, seconds_of, wait_for, wait_for_input
 
 CLOCK = time.monotonic_ns
 OPENING = b"\r\r\rC\rS8\rO\r"
@@ -253,8 +253,7 @@ def test_tcp_both_ways_and_closed_by_the_device(server: socket.socket) -> None:
 
 
 def test_tcp_that_nobody_answers() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        number = listener.getsockname()[1]
+    number = free_port()
     with pytest.raises(PortAbsent, match=f"tcp://127.0.0.1:{number}.*ping"):
         TcpPort("127.0.0.1", number, clock=CLOCK)
 

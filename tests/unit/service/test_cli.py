@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from service.__main__ import COMMANDS, main
+from tests.waiting import free_port
 
 HEAVY = ("numba", "scipy", "can", "canopen", "aiohttp", "matplotlib", "rosbags", "networkx", "shapely")
 LIGHT = r"""
@@ -52,12 +53,6 @@ def umfeld(*arguments: str, cwd: Path | None = None, **environment: str) -> Ende
         except SystemExit as end:
             code = end.code
     return Ended(int(str(code or 0)), out.getvalue(), err.getvalue())
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["status", "--connect", "tcp/127.0.0.1:1"]])

@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from sim_devices.device import F64, Mount
 from sim_devices.mavlink_autopilot import KINDS, Kind, MavlinkAutopilot, Rangefinder
 from sim_devices.udp_link import UdpLink
+from tests.waiting import GIVE_UP_S
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -401,7 +402,7 @@ def test_udp_link_sends_to_its_peer_and_then_to_who_wrote() -> None:
     ):
         for end in (first, second):
             end.bind(("127.0.0.1", 0))
-            end.settimeout(5.0)
+            end.settimeout(GIVE_UP_S)
         link = UdpLink(first.getsockname()[1])
         try:
             assert link.write(b"one") == 3

@@ -22,6 +22,7 @@ from sim_devices.lasers import MODELS
 from sim_devices.presets import PRESETS, PresetError, emulate, for_log, preset, to_toml
 from sim_devices.robot import SimScene, Trajectory, follow
 from sim_devices.world import World
+from tests.waiting import GIVE_UP_S
 
 names = st.text("abcdefgh_", min_size=1, max_size=6)
 scalars = st.one_of(
@@ -269,7 +270,7 @@ def test_autopilots_serve_whatever_names_their_port(tmp_path: Path) -> None:
             daemon.sendto(b"hello", ("127.0.0.1", port))
             attachment.service(0)
             attachment.service(2_000_000_000)
-            daemon.settimeout(5.0)
+            daemon.settimeout(GIVE_UP_S)
             assert daemon.recv(2000)[0] == 0xFD
     finally:
         attachment.stop()
