@@ -29,6 +29,7 @@ from drivers.logs import Log, LogError, LogScan, PoseKind
 from mapping.frames import Pose2, wrap_angle
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
+from mapping.grids.walls import BeamCounts
 from mapping.lines.line_map import LineMap
 from service.errors import WrongUsage
 from service.export import image_of, save_grid, save_pgm_yaml
@@ -68,6 +69,15 @@ class HoldOut:
 
 
 @dataclass(frozen=True, slots=True)
+class Walls:
+    """What `find_walls` changed: cells that it called occupied, and occupied ones that it left undecided."""
+
+    cells: int
+    added: int
+    undecided: int
+
+
+@dataclass(frozen=True, slots=True)
 class Built:
     """A finished map. robot_poses: (N, 3) x, y, yaw in the map frame, one a scan.  slam: figures of SLAM, if it ran."""
 
@@ -79,6 +89,7 @@ class Built:
     inserted: int
     hold_out: HoldOut | None
     seconds: dict[str, float]
+    walls: Walls | None = None
     slam: dict[str, object] | None = None
 
 
@@ -90,12 +101,13 @@ def build(
     hold_out: int = 0,
     resolution_m: float = 0.05,
     model: str = "log-odds",
+    crisp: bool = True,
     progress: Progress | None = None,
 ) -> Built:
     """Read a log and make its map.
 
     every: use only every N-th scan.  hold_out: of those, keep every N-th back, from the first on, and judge the grid by
-    them; 0 inserts all.
+    them; 0 inserts all.  crisp: find walls in all scans together (mapping.grids.walls), else cell by cell.
     Raises WrongUsage if the log is none, is empty, or has no poses of that source.
     """
     started = time.monotonic()
@@ -120,6 +132,7 @@ def build(
     grid = OccupancyGrid(resolution_m=resolution_m, model="counters" if model == "counters" else "log-odds")
     held = set(range(0, len(scans), hold_out)) if hold_out else set()
     insert_scans(grid, log, scans, robot_poses, left_out=held, progress=progress)
+    walls = find_walls(grid, log, scans, robot_poses, left_out=held) if crisp else None
     mapped = time.monotonic()
     line_map = lines_of(log, scans, robot_poses, left_out=held)
     lined = time.monotonic()
@@ -127,7 +140,7 @@ def build(
     return Built(
         log, scans, robot_poses, grid, line_map, len(scans) - len(held), judged,
         {"read": read - started, "localise": localised - read, "map": mapped - localised, "lines": lined - mapped},
-        slam,
+        walls, slam,
     )  # fmt: skip
 
 
@@ -158,6 +171,21 @@ def insert_scans(
             )
         if progress is not None and index % 64 == 0:
             progress(index, len(scans))
+
+
+def find_walls(
+    grid: OccupancyGrid, log: Log, scans: Sequence[LogScan], robot_poses: F64, *, left_out: set[int]
+) -> Walls:
+    """Let a grid that holds these scans call occupied what explains their ends best, and nothing else."""
+    robot_from_laser = Pose2(*log.robot_from_laser)
+    counts = BeamCounts(grid)
+    for index, (scan, pose) in enumerate(zip(scans, robot_poses)):
+        if index not in left_out:
+            map_from_laser = Pose2(*pose) @ robot_from_laser
+            counts.add(map_from_laser, scan.bearing_rad, scan.range_m, range_max_m=log.range_max_m)
+    cells = counts.walls()
+    added, undecided = grid.call_occupied(cells)
+    return Walls(len(cells), added, undecided)
 
 
 def lines_of(log: Log, scans: Sequence[LogScan], robot_poses: F64, *, left_out: set[int]) -> LineMap:
@@ -284,6 +312,12 @@ def report_of(built: Built, patch: GridPatch, source: PoseSource) -> dict[str, o
         "seconds": {name: round(value, 3) for name, value in built.seconds.items()},
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1),
     }
+    if built.walls is not None:
+        report["walls"] = {
+            "cells": built.walls.cells,
+            "added": built.walls.added,
+            "undecided": built.walls.undecided,
+        }
     if built.slam is not None:
         report["slam"] = built.slam
     if built.hold_out is not None:

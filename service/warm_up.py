@@ -68,6 +68,9 @@ def warm_up_for_logs() -> None:
     config = Config.model_validate({"lasers": {"front": {"driver": "hokuyo", "port": "/dev/null"}}})
     steps = {name: step for name, step in _steps(config).items() if name in _FOR_LOGS}
     _warm(config, steps, bool, None)
+    from mapping.grids.warm_up import warm_up_walls
+
+    warm_up_walls()
 
 
 def _warm(config: Config, steps: dict[str, Step], stop_asked: Callable[[], bool], meanwhile: Meanwhile | None) -> None:

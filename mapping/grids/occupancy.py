@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mapping.grids.evidence import (
     FREE,
@@ -262,6 +263,37 @@ class OccupancyGrid(EvidenceGrid):
                 )
                 self._pool.sonar_seen[slot] = with_sonar
             self._pool.flags[slot] = 0xFF
+
+    def call_occupied(self, cells: ArrayLike) -> tuple[int, int]:
+        """Let the laser layer call just these cells occupied: (N, 2) [row, col], N may be 0.
+
+        One that is not gets the least evidence that makes it so; others that are become undecided, so neither
+        occupied nor free. No cell becomes free, and what is free or unknown stays so but for the cells named.
+        Cells in no tile are passed over. Returns how many became occupied, how many undecided.
+        Raises ValueError if the rules have no cell that is neither (free_below above 0.5 or occupied_from not).
+        """
+        if not self.rules.free_below <= 0.5 < self.rules.occupied_from:
+            raise ValueError("a cell of probability 0.5 is free or occupied by these rules")
+        occupied = self._laser_probability >= self.rules.occupied_from
+        published = self._laser_percent >= math.ceil(100.0 * self.rules.occupied_from)  # rounded: a few more
+        least = int(np.flatnonzero(occupied)[0])
+        undecided = 0x0101 if self.model == "counters" else kernels.ODDS_ZERO
+        pool = self._pool
+        slot, at = pool.look_up(np.asarray(cells, dtype=np.int64).reshape(-1, 2))
+        named = np.unique(at[slot > 0])
+        added = named[~occupied[pool.cells[named]]]
+        lowered = 0
+        for each in pool.slots():
+            start = int(each) * kernels.TILE_CELLS
+            tile = pool.cells[start : start + kernels.TILE_CELLS]
+            lower = occupied[tile] | published[tile]
+            first, last = np.searchsorted(named, (start, start + kernels.TILE_CELLS))
+            lower[named[first:last] - start] = False
+            tile[lower] = undecided
+            lowered += int(np.count_nonzero(lower))
+            pool.flags[each] = 0xFF
+        pool.cells[added] = least
+        return len(added), lowered
 
     def clear(self) -> None:
         """Forget everything; the next changes say so."""

@@ -283,6 +283,9 @@ def build(
     hold_out: Annotated[int, typer.Option(min=0, help="Keep every N-th scan back and judge the grid by it.")] = 0,
     resolution: Annotated[float, typer.Option(min=0.005, max=1.0, help="Metres a cell.")] = 0.05,
     model: Annotated[Model, typer.Option(help="How cells count.")] = Model.LOG_ODDS,
+    crisp: Annotated[
+        bool, typer.Option(help="Find walls in all scans together; --no-crisp leaves each cell as it was counted.")
+    ] = True,
     as_json: AsJson = False,
 ) -> None:
     """Map a recorded log offline: trajectory, grid in every form, report.
@@ -306,6 +309,7 @@ def build(
             hold_out=hold_out,
             resolution_m=resolution,
             model=model.value,
+            crisp=crisp,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     _report(map_build.write(built, out, source=map_build.PoseSource(poses.value)), as_json)

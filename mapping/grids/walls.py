@@ -1,0 +1,136 @@
+"""Which cells of a finished map are walls, where poses scatter by more than a cell (S27, for maps made offline).
+
+A wall seen from poses that scatter by 5 cm has its ends in three rows of cells. Counting hits and misses cell by cell
+calls the front row occupied as well as the middle one, and every beam that grazes the wall crosses it. Seen as a
+whole the question is another: which cells explain where beams end, and are crossed by as few beams as can be?
+
+- Each beam counts one end in the cell where it ends and one pass in every cell before. Both are spread over the
+  neighbours as far as a beam's end may lie from where it was measured (`blur_cells`).
+- A cell explains the ends in itself and in the four cells beside it. Cells are chosen one after the other, each time
+  the one with most ends that no chosen cell explains for the beams that pass it (a weighted cover, greedy), until the
+  best is worth less than `ends_per_pass`.
+- Cells in which clearly more beams ended than passed are walls anyhow (`surely_per_pass`): the front of a sharp wall.
+
+So a smeared wall becomes a thin one in the middle of its ends or behind, at most a cell behind the surface, and what
+was seen once and looked through ever after is none. Costs: a walk along every beam, and sorting the cells with ends.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.frames import Pose2
+from mapping.grids.occupancy import OccupancyGrid
+from mapping.grids.tiles import TILE
+from mapping.kernels import walls as kernels
+from mapping.kernels.grids import TILE_BITS, TILE_CELLS, TILE_MASK
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)], dtype=np.int64)
+EXPLAINED = np.array([(0, 0), (-1, 0), (0, -1), (0, 1), (1, 0)], dtype=np.int64)
+HALF_A_BEAM = 0.5  # the cost of a cell that nothing passed
+
+
+@dataclass(frozen=True, slots=True)
+class WallRules:
+    """ends_per_pass: a chosen cell explains at least so many ends for each beam that passes it.
+
+    surely_per_pass: a cell in which so many beams ended for each that passed is a wall, chosen or not.
+    blur_cells: standard deviation of where a beam ends, in cells, at most 0.5 (more needs more than the neighbours).
+    """
+
+    ends_per_pass: float = 0.6
+    surely_per_pass: float = 1.5
+    blur_cells: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.ends_per_pass <= self.surely_per_pass < math.inf:
+            raise ValueError("ends_per_pass is above 0 and at most surely_per_pass, both finite")
+        if not 0.0 < self.blur_cells <= 0.5:
+            raise ValueError(f"blur_cells is above 0, at most 0.5, got {self.blur_cells}")
+
+
+class BeamCounts:
+    """Ends and passes of beams in the cells of a grid's tiles; 8 bytes a cell, as long as it lives.
+
+    grid: one that holds the scans already; what lies in no tile of it is not counted.
+    """
+
+    def __init__(self, grid: OccupancyGrid) -> None:
+        self.resolution_m = grid.resolution_m
+        self._places = np.array(grid.places(), dtype=np.int64).reshape(-1, 2)
+        self._row0, self._col0 = (int(k) for k in self._places.min(axis=0)) if len(self._places) else (0, 0)
+        table = self._places - (self._row0, self._col0)
+        rows, cols = (int(k) + 1 for k in table.max(axis=0)) if len(table) else (0, 0)
+        self._index = np.full((rows, cols), -1, dtype=np.int32)
+        self._index[table[:, 0], table[:, 1]] = np.arange(len(table))
+        self._ends, self._passes = np.zeros((2, len(table) * TILE_CELLS), dtype=np.uint32)
+
+    def add(self, map_from_sensor: Pose2, bearing_rad: F64, range_m: F64, *, range_max_m: float) -> None:
+        """One sweep; bearing_rad, range_m: (N,) as in mapping.scan.Scan."""
+        per_m = 1.0 / self.resolution_m
+        bearing = np.asarray(bearing_rad, dtype=np.float64) + map_from_sensor.yaw_rad
+        kernels.count_beams(
+            map_from_sensor.x_m * per_m, map_from_sensor.y_m * per_m, bearing, np.array(range_m, dtype=np.float64),
+            per_m, float(range_max_m), self._row0, self._col0, self._index, self._ends, self._passes,
+        )  # fmt: skip
+
+    def walls(self, rules: WallRules | None = None) -> I64:
+        """(N, 2) cells [row, col] that are walls, by rows."""
+        rules = rules if rules is not None else WallRules()
+        cells = self._cells_near_ends()
+        if len(cells) == 0:
+            return cells
+        side = math.exp(-0.5 / rules.blur_cells**2)
+        weights = np.array([side, 1.0, side]) / (1.0 + 2.0 * side)
+        weight = np.outer(weights, weights).ravel()
+        ends, passes = (
+            sum(w * self._at(counts, cells + offset) for w, offset in zip(weight, AROUND))
+            for counts in (self._ends, self._passes)
+        )
+        chosen = np.zeros(len(cells), dtype=np.bool_)
+        near = _numbers_of(cells, EXPLAINED)
+        kernels.cover(near, ends, passes + HALF_A_BEAM, float(rules.ends_per_pass), chosen)
+        chosen |= (self._at(self._ends, cells) > 0) & (ends >= rules.surely_per_pass * (passes + HALF_A_BEAM))
+        return cells[chosen]
+
+    def _cells_near_ends(self) -> I64:
+        """(N, 2) cells in or beside which beams end, by rows and columns."""
+        at = np.flatnonzero(self._ends)
+        tile, local = self._places[at // TILE_CELLS], at % TILE_CELLS
+        hit = tile * TILE + np.stack((local // TILE, local % TILE), axis=-1)
+        near = (hit[:, None, :] + AROUND).reshape(-1, 2)
+        return _cells_of_keys(np.unique(_keys(near)))
+
+    def _at(self, counts: NDArray[np.uint32], cells: I64) -> F64:
+        """Counts (N,) of cells (N, 2), 0 where no tile is."""
+        table = (cells >> TILE_BITS) - (self._row0, self._col0)
+        inside = np.all((table >= 0) & (table < self._index.shape), axis=1)
+        tile = np.full(len(cells), -1, dtype=np.int64)
+        tile[inside] = self._index[table[inside, 0], table[inside, 1]]
+        local = cells & TILE_MASK
+        at = tile * TILE_CELLS + local[:, 0] * TILE + local[:, 1]
+        return np.where(tile >= 0, counts[np.maximum(at, 0)], 0).astype(np.float64)
+
+
+def _keys(cells: I64) -> I64:
+    """One whole number for each cell, in order of rows and columns; cells lie within 2^30 of the origin."""
+    return np.asarray((cells[:, 0] << 32) + cells[:, 1] + (1 << 31))
+
+
+def _cells_of_keys(keys: I64) -> I64:
+    return np.stack((keys >> 32, (keys & 0xFFFFFFFF) - (1 << 31)), axis=-1)
+
+
+def _numbers_of(cells: I64, offsets: I64) -> NDArray[np.int32]:
+    """(N, K) number of the cell at each offset from each cell, -1 where it is none of them. cells: by rows."""
+    keys = _keys(cells)
+    wanted = _keys((cells[:, None, :] + offsets).reshape(-1, 2))
+    found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[found] == wanted, found, -1).reshape(len(cells), len(offsets)).astype(np.int32)

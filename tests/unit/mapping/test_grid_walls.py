@@ -1,0 +1,218 @@
+"""Walls of finished maps: what is counted, what explains it, and what becomes of the cells."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapping.frames import Pose2
+from mapping.grids.evidence import Model
+from mapping.grids.occupancy import FREE, OCCUPIED, PARTLY_FREE, UNKNOWN, OccupancyGrid
+from mapping.grids.walls import BeamCounts, WallRules
+from mapping.kernels import walls as kernels
+
+F64 = NDArray[np.float64]
+
+BEARING = np.radians(np.arange(-90.0, 90.5, 1.0))
+WALL_Y_M = 2.03
+MAX_M = 30.0
+
+
+def to_wall(pose: Pose2, y_m: float = WALL_Y_M) -> F64:
+    """Ranges (181,) to an endless wall along x at y_m; +inf where a beam goes away from it or meets it beyond 12 m."""
+    sine = np.sin(BEARING + pose.yaw_rad)
+    with np.errstate(divide="ignore"):
+        range_m = (y_m - pose.y_m) / sine
+    return np.where((range_m > 0.0) & (range_m < 12.0), range_m, np.inf)
+
+
+def drive(scatter_m: float, seed: int, places: int = 80) -> list[tuple[Pose2, F64]]:
+    """Scans along the wall and where they are said to be from, off across the wall and in heading."""
+    rng = np.random.default_rng(seed)
+    scans = []
+    for x in np.linspace(0.0, 8.0, places):
+        true = Pose2(float(x), 0.0, math.radians(rng.uniform(20.0, 160.0)))
+        off_m, off_rad = rng.normal(0.0, scatter_m), rng.normal(0.0, scatter_m / 20.0)
+        scans.append((Pose2(true.x_m, true.y_m + off_m, true.yaw_rad + off_rad), to_wall(true)))
+    return scans
+
+
+def grid_of(scans: list[tuple[Pose2, F64]], model: Model = "log-odds") -> OccupancyGrid:
+    grid = OccupancyGrid(model=model)
+    for pose, ranges in scans:
+        grid.insert_scan(pose, BEARING, ranges, range_max_m=MAX_M, clear_no_return=False)
+    return grid
+
+
+def counts_of(grid: OccupancyGrid, scans: list[tuple[Pose2, F64]]) -> BeamCounts:
+    counts = BeamCounts(grid)
+    for pose, ranges in scans:
+        counts.add(pose, BEARING, ranges, range_max_m=MAX_M)
+    return counts
+
+
+def held_back(grid: OccupancyGrid, scans: list[tuple[Pose2, F64]]) -> tuple[float, float]:
+    """Share of ends within 10 cm of an occupied cell, share of beams that meet one 20 cm before; by small steps."""
+    patch = grid.patch()
+    row, col = np.nonzero(patch.cells >= 65)
+    middles = (np.stack((col + patch.col0, row + patch.row0), axis=-1) + 0.5) * 0.05
+    near, early = [], []
+    for pose, ranges in scans:
+        for bearing, range_m in zip(BEARING + pose.yaw_rad, ranges):
+            if math.isfinite(range_m):
+                way = np.array([math.cos(bearing), math.sin(bearing)])
+                end = np.array([pose.x_m, pose.y_m]) + range_m * way
+                near.append(np.hypot(*(middles - end).T).min() < 0.1)
+                steps = np.arange(0.0, max(range_m - 0.2, 0.0), 0.01)
+                on_way = np.array([pose.x_m, pose.y_m]) + steps[:, None] * way
+                early.append(bool(np.any(grid.state_at(on_way) == OCCUPIED)))
+    return float(np.mean(near)), float(np.mean(early))
+
+
+def test_a_smeared_wall_becomes_a_thin_one_that_beams_end_at_and_do_not_cross() -> None:
+    scans, others = drive(0.04, seed=1), drive(0.04, seed=2, places=15)
+    grid = grid_of(scans)
+    near_before, early_before = held_back(grid, others)
+    grid.call_occupied(counts_of(grid, scans).walls())
+    near, early = held_back(grid, others)
+    assert early_before > 0.02  # else there is nothing to mend
+    assert early < early_before / 2.0
+    assert near > near_before - 0.06
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 7.0, 23.0, 45.0])
+def test_a_sharp_wall_has_no_gaps_and_stays_where_it_is(yaw_deg: float) -> None:
+    """However it lies in its cells: straight ways across it, 1 cm apart, meet an occupied cell near the surface."""
+    turn = Pose2(0.0, 0.0, math.radians(yaw_deg))
+    scans = [(turn @ pose, ranges) for pose, ranges in drive(0.0, seed=3)]
+    grid = grid_of(scans)
+    grid.call_occupied(counts_of(grid, scans).walls())
+    across = WALL_Y_M + np.arange(-0.15, 0.15, 0.0025)
+    blocked = []
+    for x in np.arange(1.0, 7.0, 0.01):
+        way = np.stack((np.full_like(across, x), across), axis=-1) @ turn.matrix()[:2, :2].T
+        blocked.append(bool(np.any(grid.state_at(way) == OCCUPIED)))
+    assert np.mean(blocked) > 0.985  # at 45 degrees a way may slip through where two cells touch at a corner
+    patch = grid.patch()
+    row, col = np.nonzero(patch.cells >= 65)
+    middles = (np.stack((col + patch.col0, row + patch.row0), axis=-1) + 0.5) * 0.05 @ turn.matrix()[:2, :2]
+    inner = (middles[:, 0] > 1.0) & (middles[:, 0] < 7.0)
+    off = middles[inner, 1] - WALL_Y_M
+    assert -0.04 < off.min() < off.max() < 0.1
+    assert 0.0 < off.mean() < 0.05
+
+
+@pytest.mark.parametrize("model", ["log-odds", "counters"])
+def test_what_stood_there_for_one_scan_is_neither_wall_nor_free(model: Model) -> None:
+    """A person 1 m in front of the wall, seen in the last scan of many: occupied by the newest hits, looked through."""
+    scans = drive(0.0, seed=4)
+    pose, ranges = scans[-1]
+    before_it = np.abs(BEARING + pose.yaw_rad - math.pi / 2.0) < math.radians(6.0)
+    scans = scans[:-1] + [(pose, np.where(before_it, 1.0, ranges))]
+    grid = OccupancyGrid(model=model)
+    for each, seen in scans[-1:] + scans[:-1] + scans[-1:] * 5:
+        grid.insert_scan(each, BEARING, seen, range_max_m=MAX_M, clear_no_return=False)
+    there = [[pose.x_m, pose.y_m + 0.99]]
+    was = grid.state_at(there)[0]
+    grid.call_occupied(counts_of(grid, scans).walls())
+    assert grid.state_at(there)[0] == (PARTLY_FREE if was == OCCUPIED else was)
+    assert was == OCCUPIED or model == "counters"
+
+
+def test_ends_and_passes_are_counted_where_they_are() -> None:
+    grid = OccupancyGrid(resolution_m=0.1)
+    grid.insert_cells([(0, 0), (5, -5)], [])
+    counts = BeamCounts(grid)
+    bearings = np.array([0.0, math.pi / 2.0, math.pi, 0.1, 0.2, 0.3, 0.4])
+    ranges = np.array([0.5, 0.3, 0.4, np.nan, np.inf, -np.inf, 9.0])
+    counts.add(Pose2(0.05, 0.05), bearings, ranges, range_max_m=5.0)
+    cells = np.array([(0, col) for col in range(-5, 7)] + [(row, 0) for row in range(1, 5)])
+    assert counts._at(counts._ends, cells).tolist() == [0, 1] + [0] * 8 + [1, 0] + [0, 0, 1, 0]
+    assert counts._at(counts._passes, cells).tolist() == [0, 0, 1, 1, 1, 3, 1, 1, 1, 1, 0, 0] + [1, 1, 0, 0]
+    assert counts._passes.sum() == 3 + 7 + 2
+    assert counts._ends.sum() == 3
+
+
+def test_what_lies_in_no_tile_is_not_counted() -> None:
+    grid = OccupancyGrid(resolution_m=0.1)
+    assert BeamCounts(grid).walls().shape == (0, 2)
+    BeamCounts(grid).add(Pose2(), np.zeros(1), np.ones(1), range_max_m=5.0)
+    grid.insert_cells([(0, 0)], [])
+    counts = BeamCounts(grid)
+    counts.add(Pose2(0.05, 0.05), np.array([0.0, math.pi]), np.array([20.0, 20.0]), range_max_m=50.0)
+    assert counts._ends.sum() == 0
+    assert counts._passes.sum() == 129  # of the 400 cells on the way; both beams pass the first
+
+
+def test_a_wall_across_the_border_of_tiles_is_found_as_elsewhere() -> None:
+    """Moved by whole cells, so that a border of tiles runs through it, a wall is the same cells, moved."""
+    found = []
+    for shift in (0, 64):
+        moved = Pose2(shift * 0.05, shift * 0.05, 0.0)
+        scans = [(moved @ pose, ranges) for pose, ranges in drive(0.03, seed=5, places=20)]
+        grid = grid_of(scans)
+        found.append({tuple(cell) for cell in (counts_of(grid, scans).walls() - shift).tolist()})
+    assert len(found[0]) > 100
+    assert len(found[0] ^ found[1]) < 0.02 * len(found[0])  # ends on a cell's border may round to either side
+
+
+def test_the_lazy_cover_chooses_as_the_plain_one_does() -> None:
+    """The plain one works out every cell's worth anew before each choice."""
+    rng = np.random.default_rng(6)
+    for _ in range(30):
+        n = int(rng.integers(1, 40))
+        near = np.concatenate((np.arange(n)[:, None], rng.integers(-1, n, (n, 3))), axis=1)
+        for row in near:  # each at most once
+            row[1:][[k in row[:j] for j, k in enumerate(row[1:].tolist(), 1)]] = -1
+        ends, cost = rng.integers(0, 9, n).astype(float), rng.integers(1, 9, n) + 0.5
+        chosen = np.zeros(n, dtype=np.bool_)
+        kernels.cover(near.astype(np.int32), ends, cost, 0.4, chosen)
+        plain, left = np.zeros(n, dtype=np.bool_), ends.copy()
+        while True:
+            worth = np.array([left[row[row >= 0]].sum() for row in near]) / cost
+            best = int(np.argmax(worth))
+            if worth[best] < 0.4:
+                break
+            plain[best] = True
+            left[near[best][near[best] >= 0]] = 0.0
+        assert np.array_equal(chosen, plain)
+
+
+@pytest.mark.parametrize("model", ["log-odds", "counters"])
+def test_calling_cells_occupied_frees_none(model: Model) -> None:
+    rng = np.random.default_rng(7)
+    grid = OccupancyGrid(model=model)
+    for _ in range(12):
+        grid.insert_cells(rng.integers(-40, 160, (2000, 2)), rng.integers(-40, 160, (4000, 2)))
+    every = np.stack(np.meshgrid(np.arange(-40, 160), np.arange(-40, 160), indexing="ij"), axis=-1).reshape(-1, 2)
+    middles = (every[:, ::-1] + 0.5) * grid.resolution_m
+    before = grid.state_at(middles)
+    named = rng.random(len(every)) < 0.1
+    grid.take_changes()
+    added, lowered = grid.call_occupied(np.concatenate((every[named], [(90000, 0)])))
+    after = grid.state_at(middles)
+    assert {int(k) for k in before} == {int(k) for k in (UNKNOWN, FREE, PARTLY_FREE, OCCUPIED)}
+    assert np.array_equal(after == OCCUPIED, named)
+    assert added == np.count_nonzero(named & (before != OCCUPIED))
+    assert lowered == np.count_nonzero(~named & (before == OCCUPIED))
+    assert np.all(before[after == FREE] == FREE)
+    assert np.all(after[~named & (before == OCCUPIED)] == PARTLY_FREE)
+    unchanged = ~named & (before != OCCUPIED)
+    assert np.array_equal(after[unchanged], before[unchanged])
+    assert sum(patch.cells.size for patch in grid.take_changes()) > 0
+
+
+def test_calling_no_cell_occupied_leaves_none() -> None:
+    grid = grid_of(drive(0.0, seed=8, places=3))
+    grid.call_occupied(np.zeros((0, 2), dtype=np.int64))
+    assert not np.any(grid.patch().cells >= 65)
+    assert OccupancyGrid().call_occupied([]) == (0, 0)
+
+
+@pytest.mark.parametrize("rules", [{"ends_per_pass": 0.0}, {"ends_per_pass": math.inf}, {"blur_cells": 0.6}])
+def test_impossible_rules_are_refused(rules: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(rules))):
+        WallRules(**rules)
