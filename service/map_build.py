@@ -1,7 +1,8 @@
 """`umfeld map build`: a recorded log becomes a map, offline, as fast as this machine goes.
 
     trajectory.tum   stamp x y z qx qy qz qw of the robot, a line for every scan, stamps as the log writes them
-    map.pgm map.yaml map.png    the occupancy grid, as map servers read it, and to look at
+    map.pgm map.yaml map.png    the occupancy grid, as map servers read it, and to look at; its walls are found in
+                     all scans together (mapping.grids.walls)
     lines.geojson    the walls as lines, of scans 20 cm or 10 degrees apart
     map.umfeld       the store, which `umfeld run` and `umfeld map load` take
     report.json      counts, timings, memory; with hold_out also how well scans that were left out fit
