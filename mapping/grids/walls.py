@@ -9,7 +9,7 @@ whole the question is another: which cells explain where beams end, and are cros
 - A cell explains the ends in itself and in the four cells beside it. Cells are chosen one after the other, each time
   the one with most ends that no chosen cell explains for the beams that pass it (a weighted cover, greedy), until the
   best is worth less than `ends_per_pass`.
-- Cells in which clearly more beams ended than passed are walls anyhow (`surely_per_pass`): the front of a sharp wall.
+- Cells in which twice as many beams ended as passed (`surely_per_pass`) are walls anyhow: the front of a sharp wall.
 
 So a smeared wall becomes a thin one in the middle of its ends or behind, at most a cell behind the surface, and what
 was seen once and looked through ever after is none. Costs: a walk along every beam, and sorting the cells with ends.
@@ -46,7 +46,7 @@ class WallRules:
     """
 
     ends_per_pass: float = 0.6
-    surely_per_pass: float = 1.5
+    surely_per_pass: float = 2.0
     blur_cells: float = 0.5
 
     def __post_init__(self) -> None:
@@ -97,7 +97,8 @@ class BeamCounts:
         chosen = np.zeros(len(cells), dtype=np.bool_)
         near = _numbers_of(cells, EXPLAINED)
         kernels.cover(near, ends, passes + HALF_A_BEAM, float(rules.ends_per_pass), chosen)
-        chosen |= (self._at(self._ends, cells) > 0) & (ends >= rules.surely_per_pass * (passes + HALF_A_BEAM))
+        ended, passed = self._at(self._ends, cells), self._at(self._passes, cells)
+        chosen |= (ended > 0) & (ended >= rules.surely_per_pass * (passed + HALF_A_BEAM))
         return cells[chosen]
 
     def _cells_near_ends(self) -> I64:
