@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers.logs import Log, read_log
 from mapping.frames import Pose2
-from mapping.localise.slam import SlamSettings
+from mapping.localise.slam_records import SlamSettings
 from service.evaluate import Trajectory, read_relations, relation_error
 from service.slam_log import SlamRun, run_slam
 

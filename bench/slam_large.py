@@ -34,7 +34,8 @@ from numpy.typing import NDArray
 from drivers.logs import read_log
 from mapping.frames import Pose2, wrap_angles
 from mapping.localise.pose_graph import relative_poses
-from mapping.localise.slam import Slam, SlamSettings, run_here
+from mapping.localise.slam import Slam, run_here
+from mapping.localise.slam_records import SlamSettings
 from mapping.scan import Scan
 from sim_devices.big_building import BigBuilding
 from sim_devices.robot import follow

@@ -104,7 +104,7 @@ class Metered(SlamLocaliser):
 
     spent_ns = 0
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> bool:
         began = time.thread_time_ns()
         fits = super().take_scan(sensor, scan, odom_from_base, base_from_sensor)
         self.spent_ns += time.thread_time_ns() - began

@@ -675,6 +675,7 @@ def parts(config: Config, found: Mapping[str, Sensor], made: Maps, localiser: Lo
         grids=made.grids,
         drive=drive,
         pose_source=None if config.drive.pose_source is None else config.source_name("poses", config.drive.pose_source),
+        odometry_laser=odometry_laser(config, found),
         max_wheel_speed_m_s=config.drive.max_wheel_speed_m_s,
         localiser=localiser,
         mounts=tilting_lasers(config),
@@ -716,6 +717,7 @@ def localiser(
         from service.line_localiser import LineLocaliser
 
         return LineLocaliser(matched, geometry_of(config.drive), start=start_pose)
+    from mapping.localise.slam_records import without_wheels
     from service.redraw import Redrawer
     from service.slam_live import SlamLocaliser, stored_or_none
 
@@ -724,7 +726,22 @@ def localiser(
     if made.building is not None and kept is None:
         redrawer.start_over(made.building.grid.tiles())
     redrawer.on_redrawn = on_redrawn or redrawer.on_redrawn
-    return SlamLocaliser(matched, start=start_pose, submit=submit, redrawer=redrawer, stored=kept)
+    alone = odometry_laser(config, found) is not None
+    return SlamLocaliser(
+        matched, start=start_pose, submit=submit, redrawer=redrawer, settings=without_wheels() if alone else None,
+        stored=kept, lost_when_broken=alone,
+    )  # fmt: skip
+
+
+def odometry_laser(config: Config, found: Mapping[str, Sensor]) -> str | None:
+    """The level laser that tells the motion of a robot on which nothing else does: the first of those that are laid
+    on the map. None where wheels or another estimator tell it, or nobody wants it told."""
+    drive = config.drive
+    if drive.source is not None or drive.pose_source is not None or not drive.laser_odometry:
+        return None
+    wanted = config.localise.sources if config.localise.mode == "map" else config.slam.sources
+    level = {name for name, sensor in found.items() if isinstance(sensor, Laser) and not sensor.tilts}
+    return min(level & sources_of(config, wanted, found), default=None)
 
 
 def geometry_of(drive: Drive) -> DriveGeometry:

@@ -47,11 +47,13 @@ class Drive(Section):
     """How wheel counts become motion."""
 
     kind: Literal["differential"] = Field(default="differential", description="Kind of drive.")
-    source: Name | None = Field(
-        default=None, description="The [wheels.NAME] that counts; without one there is no odometry."
-    )
+    source: Name | None = Field(default=None, description="The [wheels.NAME] that counts how the wheels roll.")
     pose_source: Name | None = Field(
         default=None, description="A [poses.NAME] whose poses are the odometry instead of wheel counts."
+    )
+    laser_odometry: bool = Field(
+        default=True,
+        description="Without source and pose_source: the sweeps of the first level laser are the odometry.",
     )
     wheel_radius_left_m: Positive = Field(default=0.10, description="Rolling radius of the left wheel.")
     wheel_radius_right_m: Positive = Field(default=0.10, description="Rolling radius of the right wheel.")

@@ -26,7 +26,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,6 +59,9 @@ from service.mounts import TiltingLaser
 from service.outputs import LookOut, OdomOut, Output, PolarOut, PoseOut, RangesOut, RectOut, ScanOut
 from service.sensors import AxleEncoder, Chain, Contacts, Laser, PoseSource, Ring, Sensor, Switch, Wheels
 
+if TYPE_CHECKING:
+    from mapping.localise.laser_odometry import LaserOdometry
+
 F64 = NDArray[np.float64]
 StoredTile = tuple[int, int, bytes]
 
@@ -72,6 +75,7 @@ _SECTOR_GAP_NS = 20_000_000  # sonars that follow each other faster are publishe
 _POSE_PERIOD_NS = 25_000_000
 _HELD_MAX = 512  # scans and rounds that are held back for a localiser that is late; beyond, fusion waits for it
 _TOO_FAST_IN_A_ROW = 5  # then the counts are believed, and what lay between them is unknown
+_LOST_SCANS = 3  # in a row that fit nothing, where they alone tell the motion: then it is said
 _STALE_LIMIT_NS = 500_000_000
 _FARTHEST_POSE_M = 1e7
 _CONFIRMED_M = 0.25  # a robot drives away by less between two readings of a sonar
@@ -182,9 +186,8 @@ class Localiser(Protocol):
     def take_odometry(self, state: OdometryState) -> None:
         """Each new state, in order."""
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
-        """Each sweep that odometry covers, in order of stamps, before it is put into the grids: whether it may be.
-        odom_from_base: None on a robot without odometry, whose odom frame is then its base."""
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> bool:
+        """Each sweep that odometry covers, in order of stamps, before it is put into the grids: whether it may be."""
 
     def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> bool:
         """Each round of sonars, and each touch, before it is put into the grids: whether it may be."""
@@ -197,9 +200,6 @@ class Localiser(Protocol):
 
     def locate(self, state: OdometryState) -> Located:
         """The base at the newest odometry."""
-
-    def located(self) -> Located | None:
-        """The base at the newest scan, of a robot without odometry; None if scans say nothing about it."""
 
     def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """Another map was loaded: tiles of its grid, and of its layer `slam`; the pose stays until scans tell."""
@@ -229,7 +229,7 @@ class OdometryOnly:
     def take_odometry(self, state: OdometryState) -> None:
         """Nothing to learn from it."""
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> bool:
         return True
 
     def take_round(self, source: str, heard: Round | Touch, odom_from_base: Pose2) -> bool:
@@ -243,9 +243,6 @@ class OdometryOnly:
 
     def locate(self, state: OdometryState) -> Located:
         return located_by_odometry(self._map_from_odom, state)
-
-    def located(self) -> Located | None:
-        return None
 
     def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """The robot is where it was."""
@@ -274,8 +271,9 @@ class Parts:
     """What fusion is made of.
 
     drive: name of the source whose counts make odometry, and the geometry to read them by.  pose_source: name of
-    another estimator whose poses are used instead; without either the robot is taken to stand still.  wait_ns: how
-    long a sweep waits for odometry.  footprint: (V, 2) outline of the robot in its base frame; beams that end on it are
+    another estimator whose poses are used instead.  odometry_laser: the level laser whose sweeps tell the motion where
+    nothing else does; without any of them the robot is taken to stand still.  wait_ns: how long a sweep waits for
+    odometry.  footprint: (V, 2) outline of the robot in its base frame; beams that end on it are
     left out of whatever is drawn.
     """
 
@@ -284,6 +282,7 @@ class Parts:
     grids: Sequence[GridLayer] = ()
     drive: tuple[str, DriveGeometry] | None = None
     pose_source: str | None = None
+    odometry_laser: str | None = None
     max_wheel_speed_m_s: float = 5.0
     localiser: Localiser = field(default_factory=OdometryOnly)
     mounts: Sequence[TiltingLaser] = ()
@@ -310,7 +309,8 @@ class Fusion:
         self._followed = None
         if parts.pose_source is not None:
             self._followed = FollowedPoses(max_speed_m_s=parts.max_wheel_speed_m_s)
-        self._moves = self._odometry is not None or self._followed is not None
+        self._laser_odometry = None if parts.odometry_laser is None else _laser_odometry()
+        self._moves = any(each is not None for each in (self._odometry, self._followed, self._laser_odometry))
         self._poses = PoseBuffer(capacity=max(64, int(parts.odometry_memory_s * 250)))
         self._wheels_last: WheelReading | None = None
         self._too_fast = 0
@@ -378,7 +378,6 @@ class Fusion:
             if index in self._sectors_untold or self._told_since_ns(index, now_ns) >= _SECTOR_PERIOD_NS
         ]
         self.settle(now_ns)
-        outputs.extend(self._pose_by_scans())
         outputs.extend(self._parts.localiser.outputs(now_ns))
         outputs.extend(self._clouds(now_ns))
         map_from_base = self._map_from_base_now()
@@ -394,15 +393,24 @@ class Fusion:
             "fusion.mixed_pixels": self._mixed_pixels,
             "fusion.narrow_gaps": self._narrow_gaps,
             "fusion.beams_on_robot": self._beams_on_robot,
+            **({} if self._laser_odometry is None else self._laser_odometry.counters()),
             **self._parts.localiser.counters(),
         }
 
     def troubles(self, now_ns: int) -> list[str]:
         """What fusion waits for or lacks, each in one line with the repair."""
         troubles = self._parts.localiser.troubles()
-        motion = self._parts.pose_source or (self._parts.drive and self._parts.drive[0])
-        if motion is None and self._parts.localiser.located() is None and any(g.sources for g in self._parts.grids):
-            troubles.append("no [drive] source: the grid is drawn as if the robot stood still")
+        motion = self._parts.pose_source or (self._parts.drive and self._parts.drive[0]) or self._parts.odometry_laser
+        if motion is None and any(g.sources for g in self._parts.grids):
+            troubles.append(
+                "no [drive] source, and no laser that tells the motion: the grid is drawn as if the robot stood still"
+            )
+        elif self._laser_odometry is not None:
+            if self._laser_odometry.lost_scans >= _LOST_SCANS:
+                troubles.append(
+                    f"no wheels tell the motion, and {self._laser_odometry.lost_scans} scans of {motion} in a row fit "
+                    "nothing seen before: it is moved too fast, or sees too little; hold it still for a moment"
+                )
         elif motion is not None and self._late_since_ns is not None:
             troubles.append(f"grids wait for odometry of {motion}: check that device; scans are not drawn meanwhile")
         return troubles
@@ -438,6 +446,10 @@ class Fusion:
             return
         sweep_ns = _last_beam_ns(scan) - scan.stamp_ns
         self._fresh_until_ns[laser.name] = min(scan.stamp_ns, now_ns) + stale_after_ns(reading.scan_period_ns, sweep_ns)
+        tells_motion = self._laser_odometry is not None and laser.name == self._parts.odometry_laser
+        drawn = self._to_draw(laser, scan) if tells_motion or self._is_drawn(laser.name) else None
+        if tells_motion and drawn is not None:
+            yield from self._on_motion_seen(laser, drawn)
         if fed := self._fed_by(laser.name):
             seen, base_from_sensor = self._as_seen_now(scan, laser.base_from_sensor)
             first_ns = min(scan.stamp_ns, now_ns)  # ages count from the first beam, never from later
@@ -447,8 +459,14 @@ class Fusion:
                 yield self._tell(index, now_ns)
         yield ScanOut(laser.name, scan, laser.base_from_sensor, laser.height_m)
         self._newest_stamp_ns = max(self._newest_stamp_ns, scan.stamp_ns)
-        if self._is_drawn(laser.name):
-            self._wait_for_poses(laser.name, self._to_draw(laser, scan), scan.stamp_ns, _last_beam_ns(scan), now_ns)
+        if drawn is not None:
+            self._wait_for_poses(laser.name, drawn, scan.stamp_ns, _last_beam_ns(scan), now_ns)
+
+    def _on_motion_seen(self, laser: Laser, drawn: Scan) -> list[Output]:
+        """What a sweep tells of the motion, on a robot where nothing else does: the pose at its middle."""
+        assert self._laser_odometry is not None
+        state = self._laser_odometry.take(drawn, laser.base_from_sensor)
+        return [] if state is None else self._take_state(state)
 
     def _on_tilted_scan(self, laser: Laser, reading: ScanReading, now_ns: int) -> list[Output]:
         """A sweep that is not level goes into no flat map."""
@@ -462,7 +480,7 @@ class Fusion:
         return []
 
     def _clouds(self, now_ns: int) -> list[Output]:
-        poses = None if self._odometry is None else self._poses
+        poses = self._poses if self._moves else None
         made: list[Output] = []
         for mount in self._parts.mounts:
             made.extend(mount.clouds(poses, self._map_from_base_at, now_ns))
@@ -473,7 +491,7 @@ class Fusion:
 
     def _map_from_base_at(self, stamp_ns: int) -> Pose2 | None:
         map_from_odom = self._parts.localiser.map_from_odom()
-        if self._odometry is None:
+        if not self._moves:
             return map_from_odom
         try:
             return map_from_odom @ self._poses.at(stamp_ns)
@@ -641,14 +659,6 @@ class Fusion:
     def _pose_of(self, state: OdometryState) -> PoseOut:
         return _pose_out(self._parts.localiser.locate(state))
 
-    def _pose_by_scans(self) -> list[Output]:
-        """Of a robot without odometry."""
-        located = None if self._moves else self._parts.localiser.located()
-        if located is None or located.stamp_ns == self._pose_told_ns:
-            return []
-        self._pose_told_ns = located.stamp_ns
-        return [_pose_out(located)]
-
     def _map_from_base_now(self) -> Pose2 | None:
         map_from_odom = self._parts.localiser.map_from_odom()
         if not self._moves:
@@ -741,16 +751,12 @@ class Fusion:
         self._insert_sweep(source, value, carry(map_from_base, base_from_sensor))
 
     def _draw_standing(self, source: str, value: Scan | Round | Touch) -> None:
-        """Without odometry: where the localiser has it, by scans alone."""
-        localiser = self._parts.localiser
+        """On a robot that is taken to stand where it is."""
+        map_from_base = self._parts.localiser.map_from_odom()
         if isinstance(value, Round | Touch):
-            if localiser.take_round(source, value, IDENTITY):
-                self._insert_round(source, value, localiser.map_from_odom())
+            self._insert_round(source, value, map_from_base)
             return
-        base_from_sensor = self._laser(source).base_from_sensor
-        if not localiser.take_scan(source, value, None, base_from_sensor):
-            return
-        pose = localiser.map_from_odom() @ base_from_sensor
+        pose = map_from_base @ self._laser(source).base_from_sensor
         self._insert_sweep(source, value, np.array([pose.x_m, pose.y_m, pose.yaw_rad]))
 
     def _laser(self, source: str) -> Laser:
@@ -954,6 +960,12 @@ def stale_after_ns(period_ns: int, sweep_ns: int) -> int:
 
 def _pose_out(located: Located) -> PoseOut:
     return PoseOut(located.stamp_ns, located.map_from_base, located.map_from_odom, located.covariance)
+
+
+def _laser_odometry() -> LaserOdometry:
+    from mapping.localise.laser_odometry import LaserOdometry  # its kernels, only where they are needed
+
+    return LaserOdometry()
 
 
 def _last_beam_ns(scan: Scan) -> int:

@@ -58,8 +58,8 @@ class LineLocaliser(OdometryOnly):
     def take_odometry(self, state: OdometryState) -> None:
         self._is_broken |= state.broken
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
-        if sensor not in self._sources or odom_from_base is None:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> bool:
+        if sensor not in self._sources:
             return True
         stamps = beam_stamps(scan)
         odom = odom_from_base.at(int(stamps[len(stamps) // 2]))

@@ -108,7 +108,6 @@ class KnownMapLocaliser:
         self._placed: Placed | None = None
         self._placed_odom = IDENTITY
         self._taken_ns: int | None = None
-        self._has_odometry = False
         self._told: tuple[int, State] | None = None
         self._counts = {"localise.scans": 0, "localise.scans_passed": 0, "localise.search_errors": 0}
 
@@ -118,9 +117,9 @@ class KnownMapLocaliser:
         return not (self._localiser.is_due(stamp_ns) and self._pending is not None and not self._pending.done())
 
     def take_odometry(self, state: OdometryState) -> None:
-        self._has_odometry = True
+        """Scans are laid on the map with what they bring along."""
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> bool:
         if sensor not in self._sources:
             return True
         if self._taken_ns is not None and scan.stamp_ns - self._taken_ns < _SCAN_GAP_NS:
@@ -128,16 +127,13 @@ class KnownMapLocaliser:
             return True
         self._taken_ns = scan.stamp_ns
         self._take_up(scan.stamp_ns)
-        stamp_ns, odom, base = scan.stamp_ns, None, base_from_sensor
-        if odom_from_base is not None:
-            swept = deskew(scan, odom_from_base, base_from_sensor)
-            scan, stamp_ns = swept.scan, swept.scan.stamp_ns
-            odom = swept.odom_from_sensor @ base_from_sensor.inverse()
+        swept = deskew(scan, odom_from_base, base_from_sensor)
+        scan, odom = swept.scan, swept.odom_from_sensor @ base_from_sensor.inverse()
         nearest = max(_NEAREST_M, scan.range_min_m)
         points = points_of(
-            scan.bearing_rad, scan.range_m, base, nearest_m=nearest, farthest_m=FARTHEST_M, most=BEAMS
+            scan.bearing_rad, scan.range_m, base_from_sensor, nearest_m=nearest, farthest_m=FARTHEST_M, most=BEAMS
         )  # fmt: skip
-        self._take_placed(self._localiser.add_scan(stamp_ns, points, odom), odom or IDENTITY)
+        self._take_placed(self._localiser.add_scan(scan.stamp_ns, points, odom), odom)
         self._counts["localise.scans"] += 1
         work = self._localiser.take_work()
         if work is not None:
@@ -166,13 +162,6 @@ class KnownMapLocaliser:
         at_scan = self._map_from_odom @ self._placed_odom
         covariance = compose_covariance(at_scan, self._placed.covariance, step, _step_covariance(step))
         return Located(state.stamp_ns, map_from_base, self._map_from_odom, covariance)
-
-    def located(self) -> Located | None:
-        if self._placed is None or self._has_odometry:
-            return None
-        sure = self._placed.state is State.SURE
-        covariance = self._placed.covariance if sure else _ANYWHERE
-        return Located(self._placed.stamp_ns, self._map_from_odom, self._map_from_odom, covariance)
 
     def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """Nobody can: there is no map service in this mode."""

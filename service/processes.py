@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -13,8 +12,6 @@ from pathlib import Path
 from typing import IO
 
 from service.errors import Trouble
-
-_PATIENCE_S = 4.0
 
 
 @dataclass(slots=True)
@@ -63,15 +60,11 @@ class Family:
                 raise Trouble(f"{child.name} ended with code {code}: {child.last_lines()} (its output: {child.log})")
 
     def wait_for(self, what: str, ready: Callable[[], bool], *, seconds: float) -> None:
-        """Poll until ready() holds; Trouble if a child ends or the time runs out. Who waits long is told for what."""
-        began = time.monotonic()
-        told = False
+        """Poll until ready() holds; Trouble if a child ends or the time runs out."""
+        deadline = time.monotonic() + seconds
         while not ready():
             self.check()
-            if not told and time.monotonic() > began + _PATIENCE_S:
-                told = True
-                print(f"waiting for {what}: {self.children[-1].last_lines(1)}", file=sys.stderr, flush=True)
-            if time.monotonic() > began + seconds:
+            if time.monotonic() > deadline:
                 raise Trouble(f"{what} did not come within {seconds:.0f} s; the outputs are in {self.folder}")
             time.sleep(0.05)
 
@@ -94,8 +87,8 @@ def _end_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
-def _end(process: subprocess.Popen[bytes], *, patience_s: float = 15.0) -> None:
-    """Ask, then insist: later than a daemon gives up by itself."""
+def _end(process: subprocess.Popen[bytes], *, patience_s: float = 6.0) -> None:
+    """Ask, then insist."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
         try:

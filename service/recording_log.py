@@ -1,8 +1,7 @@
 """A recording of ours as a log: its bytes through the real drivers and fusion, sweeps de-skewed by the odometry in it.
 
 What `umfeld map build` and the other commands about logs do with other people's logs they do with it. The recorded
-configuration says which laser: the first that SLAM would match. Without wheels the robot stands still in it, which SLAM
-takes for no odometry.
+configuration says which laser: the first that SLAM would match. Without wheels its own sweeps are the odometry.
 """
 
 from __future__ import annotations
@@ -46,7 +45,8 @@ def log_of_recording(path: Path) -> Log:
     """The sweeps of one laser with the robot's odometry. Trouble if there is no recording, or no laser in it."""
     recording = Recording.of(path)
     config = _plain(recording)
-    lasers = [name for name, sensor in assemble.sensors(config).items() if isinstance(sensor, Laser)]
+    found = assemble.sensors(config)
+    lasers = [name for name, sensor in found.items() if isinstance(sensor, Laser)]
     chosen = next((name for name in config.slam.sources or lasers if name in lasers), None)
     if chosen is None:
         raise Trouble(f"{path}: no laser is configured in this recording")
@@ -73,7 +73,7 @@ def log_of_recording(path: Path) -> Log:
             path=str(path), dialect="umfeld recording", file_bytes=sum(file.stat().st_size for file in recording.files),
             sha256=hashlib.sha256(files).hexdigest(),
         ),
-        wheels=_wheels_of(config),
+        wheels=_wheels_of(config), odometry_by_laser=assemble.odometry_laser(config, found) is not None,
     )  # fmt: skip
 
 

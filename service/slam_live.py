@@ -27,7 +27,8 @@ from mapping.deskew import beam_stamps, deskew
 from mapping.frames import IDENTITY, Pose2, compose_covariance
 from mapping.localise.closure_records import Closure, WorkResult
 from mapping.localise.placing import Placing
-from mapping.localise.slam import Slam, SlamSettings, SlamUpdate
+from mapping.localise.slam import Slam
+from mapping.localise.slam_records import SlamSettings, SlamUpdate
 from mapping.localise.sweep_change import Depths, depths_of, is_changed
 from mapping.localise.views import table_for
 from mapping.odometry import OdometryState
@@ -56,6 +57,8 @@ PLACING_NS = 500_000_000
 PLACING_NS_PER_PLACE = 200_000_000  # several times what a look at one takes
 SEARCH_NS = 5_000_000_000  # then it is looked for again
 SEARCH_M = 1.0
+CARRIED_M_S = 1.5  # by somebody who walks, or on its own wheels
+CARRIED_M = 1.0
 NOT_PLACED_COVARIANCE: F64 = np.diag([100.0, 100.0, 10.0])
 _GRAPH_PERIOD_NS = 1_000_000_000
 _KEYS_A_SECOND = 2_000  # larger graphs are sent more seldom
@@ -68,6 +71,15 @@ class _Search:
     future: Future[tuple[Pose2, ...]]
     due_ns: int
     odom: Pose2
+
+
+@dataclass(frozen=True, slots=True)
+class _Lost:
+    """left: where in the map the robot was seen last.  odom: where odometry went on, reach_m around there at most."""
+
+    left: Pose2
+    odom: Pose2
+    reach_m: float
 
 
 @dataclass(slots=True)
@@ -94,10 +106,13 @@ class SlamLocaliser:
         redrawer: Redrawer | None = None,
         settings: SlamSettings | None = None,
         stored: Stored | None = None,
+        lost_when_broken: bool = False,
     ) -> None:
         """sources: lasers that are matched.  start: map_from_odom before the first scan.  submit: where closures are
         looked for.  redrawer: draws the map again after a correction.  stored: the map to go on in, where the robot is
-        first looked for."""
+        first looked for.  lost_when_broken: where odometry has lost track the robot is looked for again, as far around
+        as it can have been carried meanwhile.
+        """
         self._sources = frozenset(sources)
         self._settings = settings
         self._slam = Slam(settings, keep_scans=False)
@@ -109,8 +124,10 @@ class SlamLocaliser:
         self._fits = True  # the newest scan that was looked at, or it made new ground
         self._update: SlamUpdate | None = None
         self._update_odom = IDENTITY
-        self._has_odometry = False
         self._is_broken = False
+        self._lost_when_broken = lost_when_broken
+        self._odometry_ns = 0
+        self._lost: _Lost | None = None
         self._search: _Search | None = None
         self._searched: tuple[int, Pose2] | None = None  # stamp and odometry of the last search
         self._searches = 0
@@ -141,16 +158,31 @@ class SlamLocaliser:
         return not late and (self._redrawer is None or self._redrawer.is_ready(stamp_ns))
 
     def take_odometry(self, state: OdometryState) -> None:
-        self._has_odometry = True
         self._is_broken |= state.broken
+        if state.broken and self._lost_when_broken and self._slam.keys:
+            self._unplace(state.odom_from_base, (state.stamp_ns - self._odometry_ns) * 1e-9)
+        self._odometry_ns = state.stamp_ns
 
-    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer | None, base_from_sensor: Pose2) -> bool:
+    def _unplace(self, odom: Pose2, seconds: float) -> None:
+        """Where the robot is in the map is not known any more: it is looked for, and nothing is drawn meanwhile.
+
+        odom: where odometry goes on.  seconds: how long it moved unseen before.
+        """
+        reach_m = CARRIED_M + CARRIED_M_S * seconds
+        if self._lost is not None:  # once more before it was found
+            way = self._lost.odom.inverse() @ odom
+            self._lost = _Lost(self._lost.left, odom, self._lost.reach_m + math.hypot(way.x_m, way.y_m) + reach_m)
+        else:
+            self._lost = _Lost(self._map_from_odom @ odom, odom, reach_m)
+        self._update, self._search, self._searched = None, None, None
+        self._searches, self._hypotheses = 0, (IDENTITY, ())
+        self._looked.clear()
+        self._fits = True
+
+    def take_scan(self, sensor: str, scan: Scan, odom_from_base: PoseBuffer, base_from_sensor: Pose2) -> bool:
         self._take_up(scan.stamp_ns)
         if sensor in self._sources:
-            if odom_from_base is None:
-                self._match(sensor, scan, base_from_sensor, None)
-            else:
-                self._match_moving(sensor, scan, odom_from_base, base_from_sensor)
+            self._match_moving(sensor, scan, odom_from_base, base_from_sensor)
         if not self._fits:
             self._counts["slam.scans_not_drawn"] += 1
             return False
@@ -192,16 +224,12 @@ class SlamLocaliser:
         map_from_base = self._map_from_odom @ state.odom_from_base
         return Located(state.stamp_ns, map_from_base, self._map_from_odom, covariance)
 
-    def located(self) -> Located | None:
-        if self._update is None or self._has_odometry:
-            return None
-        return Located(self._update.stamp_ns, self._map_from_odom, self._map_from_odom, self._update.covariance)
-
     def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """Key scans belong to the map that is gone; those of the new one are taken up, if it has any."""
         self._slam = Slam(self._settings, keep_scans=False)
         self._work, self._update, self._told, self._search, self._searched = None, None, None, None, None
         self._keeper, self._searches, self._hypotheses = Keeper(), 0, (IDENTITY, ())
+        self._lost = None
         self._looked.clear()
         self._fits = True
         self._asked_to_undo.clear()
@@ -234,7 +262,7 @@ class SlamLocaliser:
     def troubles(self) -> list[str]:
         if not self.is_placed() and self._searches:
             return [
-                f"the robot does not find itself in the stored map ({self._searches} searches): nothing is drawn "
+                f"the robot does not find itself in the map ({self._searches} searches): nothing is drawn "
                 "meanwhile; drive it to where the map is known, or begin a new map with another [store] path"
             ]
         if self._slam.lost_scans < DOUBT_SCANS:
@@ -293,14 +321,14 @@ class SlamLocaliser:
         seen_from_base = compose_many(sensor_from_odom, odom_from_base.at_many(beam_stamps(scan)))
         return is_changed(scan, looked.depths, seen_from_base, base_from_sensor)
 
-    def _match(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2 | None) -> bool:
+    def _match(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2) -> bool:
         if not self.is_placed():
             return self._look_for_place(sensor, scan, base_from_sensor, odom)
         if self._update is not None and scan.stamp_ns <= self._update.stamp_ns:
             self._counts["slam.scans_unordered"] += 1  # sweeps of two lasers that overlap
             return False
         if self._update is None:
-            self._slam.begin_at(self._map_from_odom @ (odom or IDENTITY))
+            self._slam.begin_at(self._map_from_odom @ odom)
         seen_odom = None if self._is_broken else odom
         self._take_update(self._slam.add_scan(scan, base_from_sensor, seen_odom, sensor=sensor), odom)
         self._is_broken = False
@@ -312,35 +340,32 @@ class SlamLocaliser:
         if work is not None:
             self._work = self._submit(work.run)
 
-    def _take_update(self, update: SlamUpdate, odom: Pose2 | None) -> None:
-        self._update, self._update_odom = update, odom or IDENTITY
+    def _take_update(self, update: SlamUpdate, odom: Pose2) -> None:
+        self._update, self._update_odom = update, odom
         self._map_from_odom = update.map_from_base @ self._update_odom.inverse()
         self._counts["slam.scans"] += 1
         self._fits = update.is_key or self._slam.lost_scans == 0
 
-    def _ends(self, scan: Scan, odom_from_base: PoseBuffer | None) -> F64:
+    def _ends(self, scan: Scan, odom_from_base: PoseBuffer) -> F64:
         """(2, 3) base poses in the map at the first and the last beam."""
-        if odom_from_base is None:
-            pose = self._map_from_odom
-            return np.array([[pose.x_m, pose.y_m, pose.yaw_rad]] * 2)
         stamps = beam_stamps(scan)
         return compose_many(self._map_from_odom, odom_from_base.at_many(stamps[[0, -1]]))
 
     # --- finding the place in a stored map
 
-    def _look_for_place(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2 | None) -> bool:
+    def _look_for_place(self, sensor: str, scan: Scan, base_from_sensor: Pose2, at: Pose2) -> bool:
         """Nothing is drawn before this has found the robot; it may drive meanwhile. Places that look alike go along
         with odometry until one is left."""
-        at = odom or IDENTITY
+        if self._slam.is_working:
+            return False
         search = self._search
         if search is not None:
             if scan.stamp_ns < search.due_ns:
                 return False
             self._search = None
-            self._hypotheses = (at, tuple(base @ (search.odom.inverse() @ at) for base in search.future.result()))
-            if len(self._hypotheses[1]) == 1 and self._join(
-                sensor, scan, base_from_sensor, odom, self._hypotheses[1][0]
-            ):
+            now = [base @ (search.odom.inverse() @ at) for base in search.future.result()]
+            self._hypotheses = (at, tuple(base for base in now if self._is_within_reach(base, at)))
+            if len(self._hypotheses[1]) == 1 and self._join(sensor, scan, base_from_sensor, at, self._hypotheses[1][0]):
                 return True
         if self._searched is not None:
             before_ns, before = self._searched
@@ -351,10 +376,17 @@ class SlamLocaliser:
         if not self._searches:
             left = placing.left_at(self._map_from_odom @ at @ base_from_sensor)
             base = None if left is None else left.pose @ base_from_sensor.inverse()
-            if base is not None and self._join(sensor, scan, base_from_sensor, odom, base):
+            if base is not None and self._join(sensor, scan, base_from_sensor, at, base):
                 return True
         self._begin_search(placing, base_from_sensor, at)
         return False
+
+    def _is_within_reach(self, map_from_base: Pose2, at: Pose2) -> bool:
+        """Whether a robot that is there now can have come there from where it was lost, whichever way it was turned."""
+        if self._lost is None:
+            return True
+        then = map_from_base @ (at.inverse() @ self._lost.odom)
+        return math.hypot(then.x_m - self._lost.left.x_m, then.y_m - self._lost.left.y_m) <= self._lost.reach_m
 
     def _placing(self, scan: Scan, base_from_sensor: Pose2, at: Pose2) -> Placing:
         state = self._slam.state()
@@ -372,12 +404,12 @@ class SlamLocaliser:
         due_ns = stamp_ns + PLACING_NS + PLACING_NS_PER_PLACE * placing.cost
         self._search = _Search(self._submit(work), due_ns, at)
 
-    def _join(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2 | None, map_from_base: Pose2) -> bool:
+    def _join(self, sensor: str, scan: Scan, base_from_sensor: Pose2, odom: Pose2, map_from_base: Pose2) -> bool:
         update = self._slam.join(scan, map_from_base, base_from_sensor, odom, sensor=sensor)
         if update is None:
             return False
         self._take_update(update, odom)
-        self._is_broken = False
+        self._is_broken, self._lost = False, None
         pose = update.map_from_base
         log.info("found itself in the stored map at x %.2f m y %.2f m", pose.x_m, pose.y_m)
         if self._redrawer is not None:

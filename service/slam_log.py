@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from drivers.logs import Log, LogScan
 from mapping.frames import Pose2, wrap_angles
 from mapping.localise.closure_records import WorkResult
-from mapping.localise.slam import Slam, SlamSettings, run_here
+from mapping.localise.slam import Slam, run_here
+from mapping.localise.slam_records import SlamSettings, without_wheels
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -41,6 +42,8 @@ def run_slam(
 
     The poses written in the log tell the motion between scans, nothing more; a log whose poses never move has none.
     """
+    if settings is None and log.odometry_by_laser:
+        settings = without_wheels()
     slam = Slam(settings, start=Pose2(*scans[0].robot_pose))
     has_odometry = _moves(scans)
     mount = Pose2(*log.robot_from_laser)

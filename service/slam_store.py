@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mapping.frames import Pose2
 from mapping.localise.closure_records import Closure
 from mapping.localise.kept_sweeps import KeptSweep
-from mapping.localise.slam import SlamState
+from mapping.localise.slam_records import SlamState
 from mapping.localise.views import View, ViewStore, table_of
 from service.fusion import Cone, Round, Touch
 from service.redraw import Kept, KeptRound, RedrawState

@@ -40,7 +40,7 @@ class SweepLines:
         seen = np.isfinite(scan.range_m) & (scan.range_m > 0.0) & (scan.range_m <= scan.range_max_m)
         if np.count_nonzero(seen) < 2:
             return no_lines()
-        at, r = poses[seen], scan.range_m[seen]
+        at, r = np.broadcast_to(poses, (len(seen), 3))[seen], scan.range_m[seen]
         angle = scan.bearing_rad[seen] + at[:, 2]
         points = middle.inverse().apply(at[:, :2] + r[:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1))
         if not in_order:

@@ -166,7 +166,7 @@ ODOM = Topic(
     ODOMETRY,
     cdr(ODOMETRY),
     "as measured",
-    "The vehicle in the odom frame, and its speed.",
+    "The vehicle in the odom frame, and its speed: by wheels, another estimator, or a laser's own sweeps.",
     Priority.DATA_HIGH,
 )
 TF_KEY = Topic(

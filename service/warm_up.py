@@ -118,7 +118,7 @@ def _steps(config: Config) -> dict[str, Step]:
         steps["localise"] = warm_up_in_map
     has_slam = config.localise.mode != "map" and config.slam.enabled
     has_slam = has_slam and any(isinstance(sensor, Laser) for sensor in found.values())
-    if has_slam or "calibration" in names:
+    if has_slam or "calibration" in names or assemble.odometry_laser(config, found) is not None:
         from mapping.localise.warm_up import warm_up as warm_up_slam
 
         steps["slam"] = warm_up_slam

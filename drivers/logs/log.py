@@ -114,7 +114,7 @@ class Log:
     no_echo_from_m: readings at or above it were taken as "no echo" (+inf if the log has none).
     stamps_repaired: how many scans' stamps were replaced (`in_order`).  stamps_made_up: all were (`made_up_stamps`).
     skipped: lines that were not used, by reason.  ticks: raw counts, where the log has them.  wheels: their meaning, or
-    what made the odometry.
+    what made the odometry.  odometry_by_laser: it was made from the scans themselves.
     """
 
     scans: tuple[LogScan, ...]
@@ -128,6 +128,7 @@ class Log:
     provenance: Provenance
     ticks: Ticks | None = None
     wheels: WheelGeometry | None = None
+    odometry_by_laser: bool = False
     skipped: dict[str, int] = field(default_factory=dict)
 
     @property

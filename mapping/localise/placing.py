@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.localise.fitting import fitting_match, nearest_keys
 from mapping.localise.scan_match import agreement
 from mapping.localise.search import find_view, raster_of
-from mapping.localise.slam import fitting_match, nearest_keys
 from mapping.localise.views import View, ViewArrays, table_for, view_of
 from mapping.scan import Scan
 

@@ -14,7 +14,8 @@ from mapping.localise.known_map import known_map, points_of
 from mapping.localise.pose_graph import Edges, optimise
 from mapping.localise.scan_match import agreement, match_view
 from mapping.localise.search import find_view, raster_of
-from mapping.localise.slam import Slam, SlamSettings
+from mapping.localise.slam import Slam
+from mapping.localise.slam_records import SlamSettings
 from mapping.localise.sweep_change import depths_of, is_changed
 from mapping.localise.views import table_for
 from mapping.scan import Scan

@@ -21,8 +21,6 @@ from service.processes import Child, Family
 
 app = typer.Typer()
 
-_HANGS_S = 600.0  # the first start compiles: half a minute here, several on a small slow computer
-
 
 @app.command()
 def demo(
@@ -80,16 +78,16 @@ def _start_all(family: Family, folder: Path, endpoint: str, *, world: str, prese
     python = [sys.executable, "-m"]
     config = folder / "umfeld.toml"
     family.start("sim", [*python, "sim_devices", "--preset", preset, "--world", world, "--dir", str(folder)])
-    family.wait_for("the emulators' configuration", config.exists, seconds=_HANGS_S)
+    family.wait_for("the emulators' configuration", config.exists, seconds=20.0)
     overlay = folder / "umfeld.d"
     overlay.mkdir(exist_ok=True)
     (overlay / "demo.toml").write_text(
         f'[network]\nlisten = ["{endpoint}"]\n\n[store]\npath = "{folder / "demo.umfeld"}"\n'
     )
     family.start("run", [*python, "service", "run", "--config", str(config)])
-    family.wait_for("the daemon", lambda: _answers(endpoint), seconds=_HANGS_S)
+    family.wait_for("the daemon", lambda: _answers(endpoint), seconds=60.0)
     view = family.start("view", [*python, "service", "view", "--connect", endpoint, "--port", str(port)])
-    family.wait_for("the page", lambda: _address_in(view) is not None, seconds=_HANGS_S)
+    family.wait_for("the page", lambda: _address_in(view) is not None, seconds=20.0)
     address = _address_in(view)
     if address is None:
         raise Trouble("the page gave no address")

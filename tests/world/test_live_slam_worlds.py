@@ -394,16 +394,6 @@ def test_other_worlds(name: str, laps: float, seed: int) -> None:
     check_closures(driving, made)
 
 
-def test_without_wheels_the_laser_alone_finds_the_way() -> None:
-    driving = drive("loop", 1.25)
-    config = CONFIG.model_copy(update={"drive": type(CONFIG.drive)(), "wheels": {}})
-    made = robot(driving.truth(0), config=config)
-    made.play([item for item in driving.items if item[0] == "front"][:400])
-    assert len(made.poses) > 350
-    assert np.quantile(pose_errors_m(driving, made.poses), 0.95) < 0.3  # sweeps are not de-skewed
-    assert made.fusion.troubles(0) == []
-
-
 def test_lines_alone_hold_a_small_computers_robot() -> None:
     """`[slam] method = "lines"`: far better than the wheels, with an uncertainty that holds."""
     driving = drive("office", 0.4)

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2, wrap_angles
 from mapping.localise.pose_graph import relative_poses
-from mapping.localise.slam import Slam, WorkIsDueError, run_here
+from mapping.localise.slam import Slam, run_here
+from mapping.localise.slam_records import WorkIsDueError
 from mapping.scan import Scan
 from sim_devices.floor_plan import load_floor_plan
 from sim_devices.robot import follow

@@ -189,3 +189,14 @@ def test_a_wall_that_was_taken_away_is_told_no_more() -> None:
         return sum(abs(float(line["end"][1]) - float(line["start"][1])) for line in lines)
 
     assert ahead(after) == pytest.approx(ahead(before) - 0.5, abs=0.11)
+
+
+@pytest.mark.parametrize("bearing", [BEARING[::-1], np.roll(BEARING, 100)], ids=["clockwise", "turning head"])
+def test_one_pose_for_a_whole_sweep_is_as_good_as_one_a_beam(bearing: F64) -> None:
+    each, one = maker(), maker()
+    for x in (0.0, 0.5, 1.0):
+        poses = still(x)
+        each.take_sweep("front", sweep(poses, bearing), poses)
+        one.take_sweep("front", sweep(poses, bearing), poses[0])
+    assert len(each.told_lines()) >= 2
+    assert told(one) == told(each)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.readings import AngleReading, DeviceEvent, LinkState, ScanReading, WheelReading
+from drivers.readings import AngleReading, DeviceEvent, LinkState, PoseReading, ScanReading, WheelReading
 from mapping.frames import Pose2
 from service import assemble, assemble_makers
 from service.config import Config, load
@@ -43,6 +43,8 @@ mount = { z_m = 1.0 }
 arm = { x_m = 0.05, z_m = 0.02 }
 [sectors.polar.around]
 sources = ["front"]
+[drive]
+laser_odometry = false
 """
 
 
@@ -105,6 +107,24 @@ def test_sweeps_of_a_nodding_laser_become_clouds_and_nothing_else(tmp_path: Path
     assert fusion.drops.get("mast", {}) == {}
 
 
+def test_clouds_follow_another_estimators_poses(tmp_path: Path) -> None:
+    pilot = TEXT.replace("laser_odometry = false", 'pose_source = "pilot"')
+    config = config_of(tmp_path, pilot + '[poses.pilot]\ndriver = "mavlink"\nport = "/dev/c"\n')
+    fusion, clouds = fusion_of(config), list[CloudOut]()
+    for ms in range(0, 2600, 5):
+        now_ns = ms * MS
+        fusion.on_item("pilot", PoseReading(now_ns, 0.1 * now_ns * 1e-9, 0.0, 0.0, True), now_ns)
+        ticks = round((math.degrees(angle_at(now_ns)) - 5.0) * -10.0)
+        fusion.on_item("mast", AngleReading(now_ns, ticks, ms > 0), now_ns)
+        if ms % 25 == 0 and ms > 0:
+            fusion.on_item("tilt", sweep_of_floor_and_wall(now_ns - 20 * MS, config), now_ns)
+            clouds += [each for each in fusion.tick(now_ns) if isinstance(each, CloudOut)]
+    assert len(clouds) == 2
+    for cloud in clouds:
+        assert cloud.map_from_base is not None
+        assert cloud.map_from_base.x_m == pytest.approx(0.1 * cloud.stamp_ns * 1e-9, abs=0.01)
+
+
 def test_a_delay_that_is_told_is_taken_out_and_all_is_the_same_again(tmp_path: Path) -> None:
     """Angles that come 20 ms late, told so: the same clouds, bit for bit."""
     late = config_of(tmp_path, TEXT.replace("zero_deg = 5.0", "zero_deg = 5.0\ndelay_ms = 20.0"))
@@ -145,8 +165,8 @@ def test_without_angles_nothing_is_placed_and_all_is_counted(tmp_path: Path) -> 
 
 
 def test_the_vehicles_motion_is_taken_out(tmp_path: Path) -> None:
-    wheels = '[drive]\nsource = "drive"\n[wheels.drive]\ndriver = "roboclaw"\nport = "/dev/c"\n'
-    config = config_of(tmp_path, TEXT + wheels)
+    wheels = TEXT.replace("laser_odometry = false", 'source = "drive"')
+    config = config_of(tmp_path, wheels + '[wheels.drive]\ndriver = "roboclaw"\nport = "/dev/c"\n')
     fusion = fusion_of(config)
     fusion.on_item("tilt", sweep_of_floor_and_wall(0, config), 20 * MS)
     for ms in range(0, 100, 5):

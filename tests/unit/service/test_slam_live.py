@@ -51,14 +51,16 @@ class Driver:
         self.redrawer = Redrawer([], None, {"front": Pose2(0.0, 0.0, 0.0)}, submit=submit)
         self.localiser = SlamLocaliser(["front"], submit=submit, redrawer=self.redrawer)
         self.stamp_ns = 0
+        self.odometry = PoseBuffer()
 
     def drive(self, scans: int, step_m: float = 0.12) -> None:
         for _ in range(scans):
             self.stamp_ns += 200 * MS
             x = -2.0 + step_m * self.stamp_ns / (200 * MS)
             pose = Pose2(x, -0.5, 0.05 * math.sin(x))
-            self.localiser.take_scan("front", Scan(self.stamp_ns, 0.0, BEARING, seen_from(pose), 0.05, 20.0), None,
-                                     Pose2(0.0, 0.0, 0.0))  # fmt: skip
+            self.odometry.add(self.stamp_ns, pose)
+            scan = Scan(self.stamp_ns, 0.0, BEARING, seen_from(pose), 0.05, 20.0)
+            self.localiser.take_scan("front", scan, self.odometry, Pose2(0.0, 0.0, 0.0))
 
 
 @pytest.fixture
