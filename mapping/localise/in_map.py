@@ -72,7 +72,7 @@ class InMapSettings:
     key_m: float = 0.2
     key_rad: float = math.radians(8.0)
     key_s: float = 0.5
-    window: int = 32
+    window: int = 64
     forget: float = 0.98
     beams_as_one: float = 14.0
     beams_as_witness: float = 30.0
@@ -180,20 +180,35 @@ class _Crowd:
     def seen(self) -> tuple[F64, F64, F64, F64]:
         return (self.log, self.explained, self.through, self.unexpected)
 
-    def weight(self, s: InMapSettings) -> F64:
-        """(K,) log of how likely each is, but for a constant.
+    def weight(self, s: InMapSettings, then: F64 | None = None) -> F64:
+        """(K,) log of how likely each is, but for a constant; see `weighed`."""
+        return self.weighed(s, then)[0]
+
+    def weighed(self, s: InMapSettings, then: F64 | None = None) -> tuple[F64, I64]:
+        """(K,) log of how likely each is, but for a constant, and (K,) how many key scans, the newest, it rests on.
 
         Either the robot was there all the time, or it was carried there: then the older key scans were made where they
-        fit best, and being carried must be made good by the newer ones.
+        fit best, and being carried must be made good by the newer ones. It may be carried anywhere, so that each of so
+        many places has its share only of the chance.
+        then: (W,) log evidence of each key scan for the place that came first when it was taken, NaN where there was
+        none. That place may have been given up since: what it explained is explained, and no place that is followed
+        now need account for it.
         """
         if not len(self):
-            return self.prior
-        bounded = np.maximum(self.log, self.log.max(axis=0) - s.most_per_key) * s.forget ** np.arange(s.window)
-        whole = self.prior + bounded.sum(axis=1)
+            return self.prior, np.zeros(0, dtype=np.int64)
+        log, prior, best = self.log, self.prior, self.log.max(axis=0)
+        if then is not None:
+            log = np.concatenate((log, np.where(np.isnan(then), best - s.most_per_key, then)[None]))
+            prior, best = np.append(prior, 0.0), log.max(axis=0)
+        bounded = np.maximum(log, best - s.most_per_key) * s.forget ** np.arange(s.window)
+        whole = prior + bounded.sum(axis=1)
         newer = np.cumsum(bounded, axis=1)
         elsewhere = (whole[:, None] - newer).max(axis=0)  # older key scans, seen from the place that explains them best
-        carried = (newer + elsewhere)[:, CARRIED_FOR - 1 :].max(axis=1) - s.carried
-        return np.asarray(np.maximum(whole, carried))
+        carried = (newer + elsewhere)[: len(self), CARRIED_FOR - 1 :] - s.carried - math.log(s.places)
+        since, whole = carried.argmax(axis=1), whole[: len(self)]
+        best_carried = carried.max(axis=1)
+        own = np.where(whole >= best_carried, s.window, since + CARRIED_FOR)
+        return np.asarray(np.maximum(whole, best_carried)), np.asarray(own)
 
 
 def _crowd_at(poses: F64, covariance: F64, window: int) -> _Crowd:
@@ -217,6 +232,7 @@ class Search:
     keys: tuple[_Key, ...]  # the newest first
     joined: int  # so many of them are searched by; all of them judge what was found
     near: tuple[Pose2, float] | None
+    then: F64  # see `_Crowd.weight`
 
     def run(self) -> SearchResult:
         """Places at the newest key scan, with the evidence of all of them."""
@@ -233,8 +249,8 @@ class Search:
 
     def candidates(self, most: int = 8) -> tuple[Candidate, ...]:
         """What run() finds, for people: the best first."""
-        crowd = _ranked(self.run().crowd, self.settings)
-        return _told(crowd, crowd.weight(self.settings), most)
+        crowd = _ranked(self.run().crowd, self.settings, self.then)
+        return _told(crowd, crowd.weight(self.settings, self.then), most)
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,6 +276,7 @@ class MapLocaliser:
         self.events: Counter[str] = Counter()
         self._crowd = _crowd_at(np.zeros((0, 3)), _anywhere(), self.settings.window)
         self._keys: deque[_Key] = deque(maxlen=self.settings.window)  # the newest first
+        self._then: F64 = np.full(self.settings.window, math.nan)  # what each meant to the place that was first then
         self._last_odom: Pose2 | None = None
         self._last_ns: int | None = None
         self._anchor: Pose2 | None = None  # odometry at the last key scan that was taken for way or turn
@@ -301,7 +318,7 @@ class MapLocaliser:
         s, crowd = self.settings, self._crowd
         if not len(crowd):
             return Located(stamp_ns, self.state, 0.0, None, _anywhere(), (), self._evidence)
-        candidates = _told(crowd, crowd.weight(s), 8)
+        candidates = _told(crowd, crowd.weight(s, self._then), 8)
         told = crowd.covariance[0] + np.diag([s.floor_m**2, s.floor_m**2, s.floor_rad**2])
         return Located(
             stamp_ns, self.state, self._probability, candidates[0].pose, told, candidates, self._evidence
@@ -359,11 +376,13 @@ class MapLocaliser:
         else:
             self._anchor, self._stood = key.odom_from_base, 0
         self._keys.appendleft(key)
+        if not instead:
+            self._then = np.concatenate(([math.nan], self._then[:-1]))
         if len(self._crowd):
             crowd = _corrected(self.known, key.points, self._crowd, self.settings, turned=FIRST)
-            self._crowd = _ranked(
-                _with_evidence(self.known, key.points, crowd, self.settings, instead=instead), self.settings
-            )
+            crowd = _with_evidence(self.known, key.points, crowd, self.settings, instead=instead)
+            self._then = np.concatenate((crowd.log[:1, 0], self._then[1:]))
+            self._crowd = _ranked(crowd, self.settings, self._then)
         self._judge_state()
 
     def _judge_state(self) -> None:
@@ -387,16 +406,19 @@ class MapLocaliser:
         crowd = self._crowd
         if not len(crowd):
             return Evidence()
-        weight = crowd.weight(self.settings)
+        weight, rests_on = crowd.weighed(self.settings, self._then)
         away = np.hypot(*(crowd.poses[:, :2] - crowd.poses[0, :2]).T) > RIVAL_M
         rival = away | (np.abs(wrap_angles(crowd.poses[:, 2] - crowd.poses[0, 2])) > RIVAL_RAD)
         n, last = len(self._keys), min(len(self._keys), 6)
+        own = max(1, min(int(rests_on[0]), n))
         return Evidence(
             lead=float(weight[0] - np.logaddexp.reduce(weight[rival])) if rival.any() else self.settings.margin,
             explained=float(crowd.explained[0, :last].mean()),
             explained_now=float(np.average(crowd.explained[0, : min(n, 2)], weights=[1 + self._stood, 1][:n])),
             through=float(crowd.through[0, :last].mean()),
             keys=n,
+            own_keys=own,
+            explained_own=float(crowd.explained[0, :own].mean()),
             challenged=self._challenged,
         )
 
@@ -414,7 +436,7 @@ class MapLocaliser:
         joined = len(self._keys)
         if self._doubted is not None and self._next_search % 2 == 0:
             joined = max(1, sum(key.number > self._doubted - CARRIED_FOR for key in self._keys))
-        self._outstanding = Search(self._next_search, self.known, s, tuple(self._keys), joined, self._hint)
+        self._outstanding = Search(self._next_search, self.known, s, tuple(self._keys), joined, self._hint, self._then)
         self._next_search += 1
         self._hint = None
         self._handed_out = False
@@ -431,7 +453,7 @@ class MapLocaliser:
     def search_now(self, near: tuple[Pose2, float] | None = None) -> Search | None:
         """A search by the key scans there are, beside the own ones; nothing changes. None before the first scan."""
         keys = tuple(self._keys)
-        return Search(-1, self.known, self.settings, keys, len(keys), near) if keys else None
+        return Search(-1, self.known, self.settings, keys, len(keys), near, self._then) if keys else None
 
     def abandon(self) -> None:
         """The search that is due came to nothing."""
@@ -467,7 +489,7 @@ class MapLocaliser:
             crowd = replace(crowd, prior=np.full(len(crowd), -self.settings.doubted))
         together = self._crowd.and_(crowd)
         if len(together):
-            self._crowd = _ranked(together, self.settings)
+            self._crowd = _ranked(together, self.settings, self._then)
             self._judge_state()
 
     # --- throwing away
@@ -475,6 +497,7 @@ class MapLocaliser:
     def _throw_away(self) -> None:
         self._crowd = _crowd_at(np.zeros((0, 3)), _anywhere(), self.settings.window)
         self._keys.clear()
+        self._then = np.full(self.settings.window, math.nan)
         self._doubted = None
         self._start_anew()
 
@@ -498,11 +521,11 @@ def _anywhere() -> F64:
     return np.diag([1e6, 1e6, math.pi**2])
 
 
-def _ranked(crowd: _Crowd, s: InMapSettings) -> _Crowd:
+def _ranked(crowd: _Crowd, s: InMapSettings, then: F64 | None = None) -> _Crowd:
     """Best first, one for each place, without those that are out of the running."""
     if not len(crowd):
         return crowd
-    weight = crowd.weight(s)
+    weight = crowd.weight(s, then)
     order = np.argsort(-weight, kind="stable")
     order = order[weight[order] >= weight[order[0]] - s.margin]
     crowd = crowd.rows(order)

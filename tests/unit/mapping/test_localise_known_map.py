@@ -22,6 +22,7 @@ from mapping.grids.patch import GridPatch
 from mapping.kernels import localise_known as kernels
 from mapping.kernels import localise_known_search as kernels_search
 from mapping.kernels.localise_known_search import BLOCK
+from mapping.localise.confidence import Evidence, held, probability
 from mapping.localise.in_map import (
     InMapSettings,
     Located,
@@ -462,7 +463,7 @@ def test_sure_must_be_earned_and_is_kept_for_a_moment_only(monkeypatch: pytest.M
     localiser = MapLocaliser(KNOWN, start=Pose2(3.0, 4.5, 0.0))
     stamp_ns, states = 0, []
     points = points_at(Pose2(3.0, 4.5, 0.0))
-    for probability, key_scans in (
+    for now, key_scans in (
         (0.96, 4),
         (0.98, 1),
         (0.96, 8),
@@ -472,7 +473,7 @@ def test_sure_must_be_earned_and_is_kept_for_a_moment_only(monkeypatch: pytest.M
         (0.98, 1),
         (0.69, 1),
     ):
-        told["now"] = probability
+        told["now"] = now
         for _ in range(key_scans):
             if localiser.is_due(stamp_ns):
                 localiser.abandon()
@@ -483,14 +484,63 @@ def test_sure_must_be_earned_and_is_kept_for_a_moment_only(monkeypatch: pytest.M
     assert localiser.events["lost"] == 2
 
 
+def _three_places(log: F64) -> _Crowd:
+    none = np.zeros_like(log)
+    return _Crowd(np.zeros((3, 3)), np.zeros((3, 3, 3)), np.zeros(3), log, none, none, none)
+
+
 def test_being_carried_must_be_made_good_once() -> None:
     """Three places and six key scans, the newest first: one was right until four ago, one is since, one is never."""
-    s = InMapSettings(window=6, forget=1.0, most_per_key=5.0, carried=7.0)
-    log = np.array([[-4.0, -4, -4, 0, 0, 0], [0.0, 0, 0, -3, -3, -3], [-4.0, -4, -4, -4, -4, -4]])
-    none = np.zeros_like(log)
-    crowd = _Crowd(np.zeros((3, 3)), np.zeros((3, 3, 3)), np.zeros(3), log, none, none, none)
+    s = InMapSettings(window=6, forget=1.0, most_per_key=5.0, carried=7.0, places=1)
+    crowd = _three_places(np.array([[-4.0, -4, -4, 0, 0, 0], [0.0, 0, 0, -3, -3, -3], [-4.0, -4, -4, -4, -4, -4]]))
     assert crowd.weight(s).tolist() == [-12.0, -7.0, -19.0]
     assert crowd.weight(replace(s, carried=20.0)).tolist() == [-12.0, -9.0, -24.0]
+    shared = crowd.weight(replace(s, places=4))  # carried to one of four places
+    np.testing.assert_allclose(shared, [-12.0, -7.0 - math.log(4.0), -19.0 - math.log(4.0)])
+
+
+def test_what_a_place_that_was_given_up_explained_counts_for_nobody() -> None:
+    """The place that was first until three key scans ago is not followed any more. Of three that are, none saw the
+    older key scans: whether one fits those by chance somewhat better than another decides nothing."""
+    s = InMapSettings(window=6, forget=1.0, most_per_key=5.0, carried=10.0, places=1)
+    crowd = _three_places(np.array([[0.0, 0, 0, -9, -9, -9], [-1.0, -1, -1, -7, -7, -7], [-4.0, -4, -4, -6, -6, -6]]))
+    then = np.array([0.0, 0.0, math.nan, -1.0, -1.0, -1.0])
+    alone, weight = crowd.weight(s), crowd.weight(s, then)
+    assert alone.tolist() == [-27.0, -24.0, -30.0]
+    np.testing.assert_allclose(weight, [-13.0, -16.0, -25.0])
+    assert np.array_equal(crowd.weight(s, np.full(6, math.nan)), alone)
+
+
+def test_small_differences_add_up_over_a_long_way() -> None:
+    """A corridor that repeats itself: each key scan says little, 0.2, but places are told apart by 12 m of them."""
+    s = InMapSettings()
+    log = np.full((3, s.window), -1.0)
+    log[1:] -= 0.2
+    weight = _three_places(log).weight(s)
+    assert s.window * s.key_m > 12.0
+    assert weight[0] - weight[1] > 6.0
+
+
+def test_a_map_that_explains_less_all_the_time_is_no_reason_to_doubt() -> None:
+    """83 % of the beams explained, far ahead of all rivals: sure after some way; not at once, not if it was 95 %."""
+    long = Evidence(0.0, 0.83, 0.83, 0.0, 40, 40, 0.83, True)
+    told = [
+        probability(replace(long, lead=8.0)),
+        probability(replace(long, lead=8.0, own_keys=4)),
+        probability(replace(long, lead=8.0, explained_own=0.95)),
+        probability(replace(long, lead=8.0, challenged=False)),
+        probability(replace(long, lead=0.0)),
+    ]
+    assert told[0] >= InMapSettings().sure
+    assert max(told[1:3]) < InMapSettings().stays
+    assert told[3] == 0.0
+    assert told[4] < 0.5
+    steps = [held(replace(long, lead=20.0, own_keys=keys)) for keys in (1, 4, 10, 16, 64)]
+    assert steps == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
+    poor = [held(replace(long, lead=20.0, explained_own=own)) for own in (0.6, 0.7, 0.75, 0.8)]
+    assert poor == pytest.approx([0.0, 0.0, 0.5, 1.0])  # outside the map, the best place is ahead for long too
+    drops = [held(replace(long, lead=20.0, explained_now=now)) for now in (1.0, 0.8, 0.77, 0.74, 0.2)]
+    assert drops == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])
 
 
 def test_a_heading_that_was_lost_in_a_turn_is_found_again() -> None:
