@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 SCAN_PERIOD_S = 0.025
-SWEEP_NS = 20_000_000  # from the first beam to the last byte: 19 ms of turning, and the line
+HALF_SECOND = 20  # scans
 WARM_UP_S = 4.0
 
 
@@ -122,17 +122,20 @@ async def visitor(address: str, seconds: float) -> int:
 def latencies_ms(ends_ns: Sequence[int], samples: Sequence[tuple[int, int]]) -> list[float]:
     """For each scan that reached the subscriber: from its last byte on the wire to its sector map.
 
-    samples: (came, first beam of the scan behind it). A map sent again without a new scan has the same first beam. The
-    scan's last byte is the end of a scan that lies nearest to a sweep after its first beam, so the fit of the laser's
-    clock may be off by nearly half a period either way; no end counts twice.
+    samples: (came, first beam of the scan behind it). A map sent again without a new scan has the same first beam. How
+    long after a first beam the last byte goes out (a sweep, an emulator that is late, a clock's fit that is off) is
+    taken from the quickest of the second around it, which are surely quicker than half a period; the end nearest to
+    that is the scan's. No end counts twice.
     """
-    found: list[float] = []
-    last_beam_ns, at, used = 0, 0, -1
+    fresh: list[tuple[int, int]] = []
     for came_ns, beam_ns in samples:
-        if beam_ns - last_beam_ns < SCAN_PERIOD_S * 1e9 / 2:
-            continue
-        last_beam_ns = beam_ns
-        wanted_ns = beam_ns + SWEEP_NS
+        if not fresh or beam_ns - fresh[-1][1] >= SCAN_PERIOD_S * 1e9 / 2:
+            fresh.append((came_ns, beam_ns))
+    found: list[float] = []
+    at, used = 0, -1
+    for number, (came_ns, beam_ns) in enumerate(fresh):
+        around = fresh[max(0, number - HALF_SECOND) : number + HALF_SECOND + 1]
+        wanted_ns = beam_ns + min(came - beam for came, beam in around)
         while at + 1 < len(ends_ns) and abs(ends_ns[at + 1] - wanted_ns) <= abs(ends_ns[at] - wanted_ns):
             at += 1
         if at < len(ends_ns) and at != used and ends_ns[at] <= came_ns:

@@ -42,12 +42,13 @@ def test_a_map_sent_again_is_not_a_scan_and_a_lost_scan_is_no_latency(latency: o
     assert latency.latencies_ms(ends, samples) == pytest.approx([3.0, 5.0])  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("off_ns", [-11_000_000, -5_000_000, 11_000_000])
+@pytest.mark.parametrize("off_ns", [-30_000_000, -11_000_000, 11_000_000, 40_000_000])
 def test_a_fit_of_the_clock_that_is_off_moves_no_scan_to_another(latency: object, off_ns: int) -> None:
     began, ends = scans(50)
-    samples = [(end + 2_000_000, stamp + off_ns * min(k, 10) // 10) for k, (end, stamp) in enumerate(zip(ends, began))]
+    late = [2_000_000 + 1_000_000 * (7 * k % 30) for k in range(50)]
+    samples = [(end + late[k], stamp + off_ns + 10_000 * k) for k, (end, stamp) in enumerate(zip(ends, began))]
     found = latency.latencies_ms(ends, samples)  # type: ignore[attr-defined]
-    assert found == pytest.approx([2.0] * 50)
+    assert found == pytest.approx([each / 1e6 for each in late])
 
 
 def test_no_last_byte_counts_twice(latency: object) -> None:
