@@ -76,7 +76,10 @@ class SourceHealth:
 
 @dataclass(frozen=True, slots=True)
 class WireHealth:
-    """One wire at one instant. openings: how often it was opened.  drops: what the port threw away, by reason."""
+    """One wire at one instant.
+
+    openings: how often it was opened.  attempts: how often that was tried.  drops: what the port threw away, by reason.
+    """
 
     name: str
     is_open: bool
@@ -84,6 +87,7 @@ class WireHealth:
     openings: int
     drops: dict[str, int]
     sources: dict[str, SourceHealth] = field(default_factory=dict)
+    attempts: int = 0
 
 
 class WireReader(Generic[WireT]):
@@ -117,7 +121,7 @@ class WireReader(Generic[WireT]):
         self._port: Port[WireT] | None = None
         self._port_trouble: str | None = "not opened yet"
         self._past_drops: dict[str, int] = {}
-        self._openings = 0
+        self._openings = self._attempts = 0
         self._backoff = _Backoff()
         self._heard_ns = 0
         self._turned_ns = 0  # when the loop last had its turn
@@ -226,6 +230,7 @@ class WireReader(Generic[WireT]):
                 openings=self._openings,
                 drops=drops,
                 sources={source.name: source.health(now_ns) for source in self._sources},
+                attempts=self._attempts,
             )
 
     def _open_when_due(self) -> None:
@@ -237,11 +242,13 @@ class WireReader(Generic[WireT]):
             port = self._open_port()
         except PortError as error:
             self._give_up(str(error))
+            self._attempts += 1  # the reason is told by now
             return
         with self._lock:
             self._port = port
             self._port_trouble = None
             self._openings += 1
+            self._attempts += 1
             now_ns = self._clock()
             self._heard_ns = now_ns
             self._turned_ns = now_ns

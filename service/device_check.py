@@ -96,7 +96,7 @@ def _wait_for_all(
     while now_ns() < deadline_ns:
         wires = [reader.health() for reader in readers]
         hopeless = now_ns() - began_ns >= _OPEN_S * 1e9
-        awaited = [wire for wire in wires if not hopeless or wire.is_open or wire.openings]
+        awaited = [wire for wire in wires if not hopeless or wire.is_open or wire.openings or not wire.attempts]
         sources = [source for wire in awaited for source in wire.sources.values()]
         for source in sources:
             if source.state is LinkState.RUNNING and source.readings > 0:

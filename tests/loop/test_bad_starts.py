@@ -168,13 +168,13 @@ def sonar_board() -> ByteDevice:
 
 
 def test_a_port_that_is_not_there(place: Place) -> None:
-    told = assert_told(place.umfeld("check", "--seconds", "1"), 1, f"no {place.port}", "plugged in")
+    told = assert_told(place.umfeld("check", "--seconds", "60"), 1, f"no {place.port}", "plugged in")
     assert told.startswith("front: ")
 
 
 def test_a_port_that_is_no_port(place: Place) -> None:
     place.port.write_text("not a terminal")
-    assert_told(place.umfeld("check", "--seconds", "1"), 1, "is not a serial port")
+    assert_told(place.umfeld("check", "--seconds", "60"), 1, "is not a serial port")
     assert place.port.read_text() == "not a terminal"
 
 
@@ -184,7 +184,7 @@ def test_a_port_that_may_not_be_opened(place: Place) -> None:
         attachment.add("laser", laser(), link)
         assert link.tty is not None
         os.chmod(link.tty, 0o000)
-        done = place.umfeld("check", "--seconds", "1", through=AS_MERE_OWNER if os.geteuid() == 0 else ())
+        done = place.umfeld("check", "--seconds", "60", through=AS_MERE_OWNER if os.geteuid() == 0 else ())
     assert_told(done, 1, f"no permission on {place.port}", "group", "udev rules")
 
 
@@ -194,7 +194,7 @@ def test_a_port_that_another_program_holds(place: Place) -> None:
         holder = os.open(place.port, os.O_RDWR | os.O_NOCTTY)
         try:
             fcntl.flock(holder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            assert_told(place.umfeld("check", "--seconds", "1"), 1, f"another program holds {place.port}", "fuser")
+            assert_told(place.umfeld("check", "--seconds", "60"), 1, f"another program holds {place.port}", "fuser")
         finally:
             os.close(holder)
 
@@ -203,7 +203,7 @@ def test_a_port_that_another_program_holds(place: Place) -> None:
 def test_another_device_on_the_port(place: Place, stranger: Callable[[], ByteDevice]) -> None:
     with Attachment() as attachment:
         attachment.add("laser", stranger(), PtyLink(place.port))
-        done = place.umfeld("check", "--seconds", "5")
+        done = place.umfeld("check", "--seconds", "10")
     told = assert_told(done, 1, "front: ")
     assert any(word in told for word in ("no Hokuyo", "not a Hokuyo", "another device", "does not answer")), told
     assert any(word in told for word in ("check", "port", "`")), told
@@ -214,7 +214,7 @@ def test_the_same_device_twice_is_found_where_it_is_right(place: Place) -> None:
     """The check of the checks: with the right device on the port all is well."""
     with Attachment() as attachment:
         attachment.add("laser", laser(), PtyLink(place.port))
-        done = place.umfeld("check", "--seconds", "10")
+        done = place.umfeld("check", "--seconds", "100")
     assert done.returncode == 0, done.stderr
     assert not done.stderr
 
@@ -232,7 +232,7 @@ def test_a_second_daemon_on_the_port_goes_and_the_first_stays(place: Place, tmp_
         second.port = place.port
         second.write()
         assert_told(second.umfeld("run"), 1, f"{place.port} is in use", f"process {first.pid}")
-        assert_told(second.umfeld("check", "--seconds", "1"), 1, f"{place.port} is in use", f"process {first.pid}")
+        assert_told(second.umfeld("check", "--seconds", "60"), 1, f"{place.port} is in use", f"process {first.pid}")
         assert not second.store.exists()
         sent = link.counters.sent_bytes
         wait_for("more scans for the first", lambda: link.counters.sent_bytes > sent + 50_000)
@@ -249,7 +249,7 @@ def test_an_address_that_another_program_has(place: Place) -> None:
         other.bind(("127.0.0.1", place.endpoint_port))
         other.listen()
         assert_told(place.umfeld("run"), 1, str(place.endpoint_port), "in use", "[network] listen")
-        checked = place.umfeld("check", "--seconds", "0.5")
+        checked = place.umfeld("check", "--seconds", "60")
         assert checked.returncode == 1
         assert any(str(place.endpoint_port) in line and "ss -ltnp" in line for line in checked.stderr.splitlines())
         other.settimeout(0.0)  # and it was left in peace: nobody is still connected
