@@ -23,6 +23,7 @@ Source: CiA 301 (NMT, SDO, PDO, heartbeat, emergency), CiA 406 (objects 6000h to
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -52,6 +53,7 @@ _SEARCH_PERIOD_NS = 250_000_000
 _REFUSED_RETRY_NS = 1_000_000_000
 _START_REPEAT_NS = 300_000_000
 _SYNC_PATIENCE_NS = 1_000_000_000  # started, alive, but no TPDO2 for so long: this node does not know SYNC
+_TRIPS_KEPT = 15
 _SHORTEST_ANSWER_LIMIT_NS = 40_000_000  # later ones would be taken for answers to the next SYNC
 _UNKNOWN_STEPS = 65536
 _JUMP_FACTOR = 10.0  # a count that moved ten times as far as the fastest wheel was set anew
@@ -624,6 +626,7 @@ class _Cia406Conversation(ABC):
         self._round: _Round | None = None
         self._sync_due_ns = 0
         self._deaf_since_ns: int | None = None
+        self._trips_ns: deque[int] = deque(maxlen=_TRIPS_KEPT)  # from SYNC to the first answer
 
     def _all_started(self) -> bool:
         return all(node.phase is _Phase.STARTED for node in self._nodes)
@@ -678,9 +681,21 @@ class _Cia406Conversation(ABC):
             return None
         self._round = None
         self._deaf_since_ns = stamp_ns
-        # Sampled when the nodes heard SYNC: between its sending and the first answer. The way there and back is about
-        # equally long (adapter, host), so the middle is right to within half their difference.
-        return self._reading(answers, (current.sync_ns + current.first_answer_ns) // 2)
+        return self._reading(answers, self._sampled_ns(current.sync_ns, current.first_answer_ns))
+
+    def _sampled_ns(self, sync_ns: int, answer_ns: int) -> int:
+        """When the nodes heard SYNC: between its sending and the first answer.
+
+        The way there and back is about equally long (adapter, host), so the middle is right to within half their
+        difference. Longer than the limit no answer takes, or the next SYNC would have been sent: then this program was
+        held up while the answer lay waiting, and the ways took what they usually take.
+        """
+        trip_ns = answer_ns - sync_ns
+        if not self._produce_sync or trip_ns <= self._answer_limit_ns():
+            self._trips_ns.append(trip_ns)
+        else:
+            trip_ns = sorted(self._trips_ns)[len(self._trips_ns) // 2] if self._trips_ns else self._answer_limit_ns()
+        return sync_ns + trip_ns // 2
 
     def _reading(self, answers: Sequence[int], stamp_ns: int) -> Reading:
         stamp_ns = max(stamp_ns, self._last_stamp_ns + 1)

@@ -474,6 +474,21 @@ def test_first_reading_follows_from_nothing_and_stamps_lie_between_sync_and_answ
         assert reading.stamp_ns == sync_ns + MS // 4
 
 
+def test_an_answer_that_lay_waiting_for_us_was_sampled_as_soon_as_any() -> None:
+    """This program was held up for 200 ms behind a SYNC: the middle would be 100 ms late."""
+    bench = Bench()
+    bench.run(200)
+    asked: list[CanFrame] = []
+    while CanFrame(0x80) not in asked:
+        asked = [frame for frame in bench.pair.requests(bench.now_ns) if isinstance(frame, CanFrame)]
+        bench.now_ns += MS
+    sync_ns = bench.now_ns - MS
+    answers = [answer for node in bench.nodes for answer in node.step(sync_ns, asked)]
+    bench.now_ns = sync_ns + 200 * MS
+    (reading,) = bench.say(*answers)
+    assert reading.stamp_ns == sync_ns + MS // 4
+
+
 @pytest.mark.parametrize("produce_sync", [True, False])
 def test_positions_by_timer_are_switched_off_where_sync_is_ours(produce_sync: bool) -> None:
     """On a bus with another master somebody else may live on them."""
