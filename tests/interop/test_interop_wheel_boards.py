@@ -33,7 +33,7 @@ from sim_devices.encoder_odrive import ODriveAxis
 from sim_devices.encoder_roboclaw import RoboClaw
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.wheel import Side, Wheel
-from tests.waiting import SteadyClock, wait_for
+from tests.waiting import GIVE_UP_S, SteadyClock, wait_for
 
 TURN_M = 2.0 * np.pi * 0.1
 
@@ -242,14 +242,15 @@ def test_canopen_finds_an_encoder_and_sets_up_its_pdos(tmp_path: Path) -> None:
         network.connect(interface="slcan", channel=str(tmp_path / "can"), bitrate=1_000_000, sleep_after_open=0)
         try:
             network.scanner.search()
-            time.sleep(0.3)
+            wait_for("the node", lambda: network.scanner.nodes)
             assert network.scanner.nodes == [0x20]
             kinds = {0x1000: ("device type", 7), 0x1008: ("name", 9), 0x1017: ("heartbeat", 6), 0x6004: ("position", 7)}
             node = network.add_node(0x20, _described(kinds))
+            node.sdo.RESPONSE_TIMEOUT = GIVE_UP_S
             assert node.sdo[0x1000].raw & 0xFFFF == 406
             assert node.sdo[0x1008].raw == "UMFELD SIM ENC"
             node.sdo[0x1017].raw = 50
-            assert node.nmt.wait_for_heartbeat(2.0) == "PRE-OPERATIONAL"
+            assert node.nmt.wait_for_heartbeat(GIVE_UP_S) == "PRE-OPERATIONAL"
             node.tpdo.read()
             heard: dict[int, list[int]] = {1: [], 2: []}
             for number, kind in ((1, 254), (2, 1)):
@@ -263,10 +264,8 @@ def test_canopen_finds_an_encoder_and_sets_up_its_pdos(tmp_path: Path) -> None:
                 pdo.add_callback(lambda found, values=heard[number]: values.append(found["position"].raw))
             node.nmt.state = "OPERATIONAL"
             network.sync.start(0.05)
-            time.sleep(1.0)
+            wait_for("a second's positions by timer and by SYNC", lambda: len(heard[1]) >= 50 and len(heard[2]) >= 20)
             network.sync.stop()
-            assert len(heard[1]) == pytest.approx(50, abs=8)
-            assert len(heard[2]) == pytest.approx(20, abs=4)
             assert heard[1] == sorted(heard[1])
             assert heard[1][-1] > heard[1][0]
         finally:
@@ -342,7 +341,9 @@ def test_bridge_by_a_blocking_serial_client(tmp_path: Path) -> None:
                         return value
                 raise AssertionError(f"no answer to {command!r}")
 
-            assert execute("b") == "57600"
+            assert execute("b", 100) == "57600"  # a board that boots says nothing
+            port.timeout = GIVE_UP_S  # from here on every question has its answer: asked again, two would come
+            wait_for("the answers to all that was asked", lambda: execute("r") == "OK")
             assert execute("r") == "OK"
             assert execute("m 20 20") == "OK"
             began_ns = clock()
