@@ -47,7 +47,7 @@ Curve = list[tuple[float, float, float]]  # parameter, near, early, the last two
 LOGS: Final = ("belgioioso", "seattle", "acapulco")
 EVERY: Final = 10
 PERCENT: Final = (5, 10, 20, 30, 40, 50, 65, 75, 85, 95)
-ENDS_PER_PASS: Final = (0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0, 1.3, 1.5)
+ENDS_PER_PASS: Final = (0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 DEFAULT_PERCENT, DEFAULT_ENDS = 65, WallRules().ends_per_pass
 PIECE: Final = (700, 950, 200, 450)  # of belgioioso: rows and columns of its map that are drawn
 

@@ -9,10 +9,11 @@ whole the question is another: which cells explain where beams end, and are cros
 - A cell explains the ends in itself and in the four cells beside it. Cells are chosen one after the other, each time
   the one with most ends that no chosen cell explains for the beams that pass it (a weighted cover, greedy), until the
   best is worth less than `ends_per_pass`.
-- Cells in which twice as many beams ended as passed (`surely_per_pass`) are walls anyhow: the front of a sharp wall.
+- A cell in which no beam ended is no wall, and one in which more ended than passed (`surely_per_pass`) is one anyhow:
+  else walls would move behind the surface, where beams pass seldom, and robots that localise by them with them.
 
-So a smeared wall becomes a thin one in the middle of its ends or behind, at most a cell behind the surface, and what
-was seen once and looked through ever after is none. Costs: a walk along every beam, and sorting the cells with ends.
+So a smeared wall becomes a thin one in the middle of its ends or a little behind, and what was seen once and looked
+through ever after is none. Costs: a walk along every beam, and sorting the cells with ends.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class WallRules:
     """
 
     ends_per_pass: float = 0.6
-    surely_per_pass: float = 2.0
+    surely_per_pass: float = 1.0
     blur_cells: float = 0.5
 
     def __post_init__(self) -> None:
@@ -94,11 +95,11 @@ class BeamCounts:
             sum(w * self._at(counts, cells + offset) for w, offset in zip(weight, AROUND))
             for counts in (self._ends, self._passes)
         )
-        chosen = np.zeros(len(cells), dtype=np.bool_)
-        near = _numbers_of(cells, EXPLAINED)
-        kernels.cover(near, ends, passes + HALF_A_BEAM, float(rules.ends_per_pass), chosen)
         ended, passed = self._at(self._ends, cells), self._at(self._passes, cells)
-        chosen |= (ended > 0) & (ended >= rules.surely_per_pass * (passed + HALF_A_BEAM))
+        cost = np.where(ended > 0.0, passes + HALF_A_BEAM, np.inf)
+        chosen = np.zeros(len(cells), dtype=np.bool_)
+        kernels.cover(_numbers_of(cells, EXPLAINED), ends, cost, float(rules.ends_per_pass), chosen)
+        chosen |= (ended > 0.0) & (ended >= rules.surely_per_pass * (passed + HALF_A_BEAM))
         return cells[chosen]
 
     def _cells_near_ends(self) -> I64:
