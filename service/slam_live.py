@@ -411,7 +411,7 @@ class SlamLocaliser:
         self._take_update(update, odom)
         self._is_broken, self._lost = False, None
         pose = update.map_from_base
-        log.info("found itself in the stored map at x %.2f m y %.2f m", pose.x_m, pose.y_m)
+        log.info("found itself in the map at x %.2f m y %.2f m", pose.x_m, pose.y_m)
         if self._redrawer is not None:
             self._redrawer.forget_recent()
         return True

@@ -40,7 +40,7 @@ STILL_RAD = math.radians(0.1)  # from where it was told last, and
 STILL_M_S = 0.03  # so slow:
 STILL_RAD_S = math.radians(2.0)  # it stands, and what is told does not tremble
 SHORT_NS = 20_000_000  # half of a sweep in which motion hardly changes: what it says holds for its last beam, too
-LOST_NS = 1_000_000_000  # without a sweep that fits, or three periods: then where it has come to is not known
+LOST_NS = 600_000_000  # without a sweep that fits, or three periods: then where it has come to is not known
 MOST_LOST_NS = 3_000_000_000
 UNKNOWN_M_S = 1.0
 UNKNOWN_RAD_S = 1.0
@@ -63,7 +63,7 @@ class LaserOdometry:
         self._key_covariance: F64 = np.zeros((3, 3))
         self._told_pose = IDENTITY
         self._heard_ns: int | None = None
-        self._period_ns = 0  # between the last two sweeps
+        self._period_ns = MOST_LOST_NS  # between the last two sweeps
         self._twist: F64 = np.zeros(3)  # of the base, from the middle of the last sweep but one to that of the last
 
     def take(self, scan: Scan, base_from_sensor: Pose2) -> OdometryState | None:
@@ -82,7 +82,9 @@ class LaserOdometry:
         if last is not None and middle_ns - last[0] < LEAST_NS:
             return None
         limit_ns = max(LOST_NS, min(3 * self._period_ns, MOST_LOST_NS))
-        self._period_ns, self._heard_ns = middle_ns - (self._heard_ns or middle_ns), middle_ns
+        if self._heard_ns is not None:
+            self._period_ns = middle_ns - self._heard_ns
+        self._heard_ns = middle_ns
         if last is None or middle_ns - last[0] > limit_ns:
             return self._begun(scan, base_from_sensor, middle_ns)
         seconds = (middle_ns - last[0]) * 1e-9

@@ -143,7 +143,7 @@ def test_what_it_says_of_its_own_error_grows_with_the_way_and_holds() -> None:
     assert np.trace(states[-1].covariance) > np.trace(states[20].covariance) > 0.0
 
 
-def test_after_a_second_unseen_it_says_that_it_lost_track_and_goes_on() -> None:
+def test_after_some_time_unseen_it_says_that_it_lost_track_and_goes_on() -> None:
     odometry = LaserOdometry()
     for k in range(1, 10):
         odometry.take(sweep(lambda _: IDENTITY, k * PERIOD_NS), MOUNT)
@@ -165,11 +165,11 @@ def test_sweeps_that_fit_nothing_tell_nothing_until_they_fit_again() -> None:
     for k in range(1, 10):
         odometry.take(sweep(lambda _: IDENTITY, k * PERIOD_NS), MOUNT)
     rng = np.random.default_rng(0)
-    for k in range(10, 14):
+    for k in range(10, 13):
         crowd = Scan(k * PERIOD_NS, PERIOD_NS / BEAMS, BEARING, rng.uniform(0.3, 1.0, BEAMS), 0.1, 12.0)
         assert odometry.take(crowd, MOUNT) is None
-    assert odometry.lost_scans == 4
-    state = odometry.take(sweep(lambda _: IDENTITY, 14 * PERIOD_NS), MOUNT)
+    assert odometry.lost_scans == 3
+    state = odometry.take(sweep(lambda _: IDENTITY, 13 * PERIOD_NS), MOUNT)
     assert state is not None
     assert not state.broken
     assert max(off(state, lambda _: IDENTITY, 0.0)) < 0.02
