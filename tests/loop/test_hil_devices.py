@@ -233,9 +233,11 @@ class Rig:
         return wait_for(f"{source} {'back' if running else 'missed'}", found)
 
     def waited_ns(self) -> int:
-        """How long the machine has let reader and fusion wait: nobody sees anything meanwhile."""
-        threads = [each for each in threading.enumerate() if each.name in ("fusion", f"wire {self.reader.name}")]
-        return waited_ns(*threads)
+        """How long the machine has let this process wait, by its threads: whichever waits may hold the others up.
+
+        Nobody sees anything while reader or fusion wait, or while a thread waits that has the interpreter's lock.
+        """
+        return waited_ns(*threading.enumerate())
 
     def overrun_bytes(self) -> int:
         """What ptys had no room for, because this machine let the reader wait: lost, and no fault of the driver."""
