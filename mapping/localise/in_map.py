@@ -190,9 +190,9 @@ class _Crowd:
         Either the robot was there all the time, or it was carried there: then the older key scans were made where they
         fit best, and being carried must be made good by the newer ones. It may be carried anywhere, so that each of so
         many places has its share only of the chance.
-        then: (W,) log evidence of each key scan for the place that came first when it was taken, NaN where there was
-        none. That place may have been given up since: what it explained is explained, and no place that is followed
-        now need account for it.
+        then: (W,) log evidence of each key scan for the place that was sure when it was taken, NaN where none was.
+        That place may have been given up since: what it explained is explained, and no place that is followed now
+        need account for it.
         """
         if not len(self):
             return self.prior, np.zeros(0, dtype=np.int64)
@@ -276,7 +276,7 @@ class MapLocaliser:
         self.events: Counter[str] = Counter()
         self._crowd = _crowd_at(np.zeros((0, 3)), _anywhere(), self.settings.window)
         self._keys: deque[_Key] = deque(maxlen=self.settings.window)  # the newest first
-        self._then: F64 = np.full(self.settings.window, math.nan)  # what each meant to the place that was first then
+        self._then: F64 = np.full(self.settings.window, math.nan)  # what each meant to the place that was sure then
         self._last_odom: Pose2 | None = None
         self._last_ns: int | None = None
         self._anchor: Pose2 | None = None  # odometry at the last key scan that was taken for way or turn
@@ -381,7 +381,8 @@ class MapLocaliser:
         if len(self._crowd):
             crowd = _corrected(self.known, key.points, self._crowd, self.settings, turned=FIRST)
             crowd = _with_evidence(self.known, key.points, crowd, self.settings, instead=instead)
-            self._then = np.concatenate((crowd.log[:1, 0], self._then[1:]))
+            if self.state is State.SURE:
+                self._then = np.concatenate((crowd.log[:1, 0], self._then[1:]))
             self._crowd = _ranked(crowd, self.settings, self._then)
         self._judge_state()
 

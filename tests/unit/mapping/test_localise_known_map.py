@@ -500,7 +500,7 @@ def test_being_carried_must_be_made_good_once() -> None:
 
 
 def test_what_a_place_that_was_given_up_explained_counts_for_nobody() -> None:
-    """The place that was first until three key scans ago is not followed any more. Of three that are, none saw the
+    """The place that was sure until three key scans ago is not followed any more. Of three that are, none saw the
     older key scans: whether one fits those by chance somewhat better than another decides nothing."""
     s = InMapSettings(window=6, forget=1.0, most_per_key=5.0, carried=10.0, places=1)
     crowd = _three_places(np.array([[0.0, 0, 0, -9, -9, -9], [-1.0, -1, -1, -7, -7, -7], [-4.0, -4, -4, -6, -6, -6]]))
@@ -509,6 +509,22 @@ def test_what_a_place_that_was_given_up_explained_counts_for_nobody() -> None:
     assert alone.tolist() == [-27.0, -24.0, -30.0]
     np.testing.assert_allclose(weight, [-13.0, -16.0, -25.0])
     assert np.array_equal(crowd.weight(s, np.full(6, math.nan)), alone)
+
+
+def test_only_a_place_that_is_sure_keeps_what_it_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While places change in the search, the best of each moment together would explain more than any single one."""
+    told = {"now": 0.5}
+    monkeypatch.setattr("mapping.localise.in_map.probability", lambda evidence: told["now"])
+    localiser = MapLocaliser(KNOWN, start=Pose2(3.0, 4.5, 0.0))
+    for k in range(6):
+        told["now"] = 0.99 if k >= 3 else 0.5
+        if localiser.is_due(k * 500_000_000):
+            localiser.abandon()
+        at = Pose2(3.0 + 0.25 * k, 4.5, 0.0)
+        localiser.add_scan(k * 500_000_000, points_at(at), at)
+    assert localiser.state is State.SURE
+    assert np.isnan(localiser._then[:6]).tolist() == [False, False, True, True, True, True]  # the newest first
+    np.testing.assert_array_equal(localiser._then[:2], localiser._crowd.log[0, :2])
 
 
 def test_small_differences_add_up_over_a_long_way() -> None:
