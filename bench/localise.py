@@ -1,8 +1,8 @@
 """Localisation in a known map on recorded logs: global start, tracking, kidnapping, and how well its probability tells.
 
-    UMFELD_DATA=folder .venv/bin/python bench/localise.py [--starts 200] [--kidnaps 40] [--cases fr079-2 wean3 ...]
-        [--seed 7] [--no-tracking] [--fit] [--json FILE] [--picture FILE]
-    .venv/bin/python bench/localise.py --drawn FILE [FILE ...] --picture FILE
+    UMFELD_DATA=folder PYTHONPATH=. .venv/bin/python bench/localise.py [--starts 200] [--kidnaps 40]
+        [--cases fr079-2 wean3 ...] [--seed 7] [--no-tracking] [--fit] [--json FILE] [--picture FILE]
+    PYTHONPATH=. .venv/bin/python bench/localise.py --drawn FILE [FILE ...] --picture FILE
 
 Cases: LOG-1 is the first half of a log played in a map of its second half, LOG-2 the second half in a map of the first;
 maps and truth are by SLAM over the whole log, so both halves lie in one frame. wean1, wean3 are Wean Hall's logs in the
