@@ -41,7 +41,8 @@ class Robot:
     """A daemon's fusion and building grid, standing at the origin."""
 
     def __init__(self, **grid: object) -> None:
-        config = Config.model_validate({"lasers": {"front": {"driver": "hokuyo", "port": "/dev/none"}}, "grid": grid})
+        lasers, stands = {"front": {"driver": "hokuyo", "port": "/dev/none"}}, {"laser_odometry": False}
+        config = Config.model_validate({"lasers": lasers, "drive": stands, "grid": grid})
         sensors = assemble.sensors(config)
         maps = assemble.maps(config, sensors)
         assert maps.building is not None
