@@ -172,7 +172,7 @@ class SlamLocaliser:
         if self._lost is not None:  # once more before it was found
             way = self._lost.odom.inverse() @ odom
             self._lost = _Lost(self._lost.left, odom, self._lost.reach_m + math.hypot(way.x_m, way.y_m) + reach_m)
-        else:
+        elif self.is_placed():  # in a stored map it may be anywhere
             self._lost = _Lost(self._map_from_odom @ odom, odom, reach_m)
         self._update, self._search, self._searched = None, None, None
         self._searches, self._hypotheses = 0, (IDENTITY, ())

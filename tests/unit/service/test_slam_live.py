@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.odometry import OdometryState
 from mapping.pose_buffer import PoseBuffer
 from mapping.scan import Scan
 from service import assemble
@@ -18,7 +19,7 @@ from service.background import Submit, at_once
 from service.fusion import Cone, OdometryOnly, Round
 from service.redraw import Redrawer
 from service.rpc import CallRefused, Calls
-from service.slam_live import SlamLocaliser
+from service.slam_live import SlamLocaliser, stored_or_none
 
 F64 = NDArray[np.float64]
 
@@ -227,3 +228,26 @@ def test_what_fits_nothing_is_not_drawn_until_something_fits_again() -> None:
     assert any("nothing is drawn" in trouble for trouble in robot.localiser.troubles())
     assert robot.look(here, here)
     assert robot.localiser.take_round("sonars", round_, here)
+
+
+@pytest.mark.parametrize("left_m", [0.0, 20.0], ids=["left near by", "left elsewhere"])
+def test_a_robot_that_was_never_found_may_be_anywhere_though_track_is_lost(left_m: float) -> None:
+    """How far it can have been carried counts from where it was seen, not from where a stored map left it."""
+    driver = Driver()
+    driver.drive(20)
+    keep = driver.localiser.kept()
+    assert keep is not None
+    redrawer = Redrawer([], None, {"front": Pose2()}, submit=at_once)
+    again = SlamLocaliser(
+        ["front"], start=Pose2(left_m, 0.0, 0.0), submit=at_once, redrawer=redrawer, stored=stored_or_none(keep()),
+        lost_when_broken=True,
+    )  # fmt: skip
+    odometry, place = PoseBuffer(), Pose2(-1.8, 0.3, 0.1)
+    for k in range(60):
+        stamp_ns = driver.stamp_ns + k * 200 * MS
+        state = OdometryState(stamp_ns, Pose2(), np.zeros((3, 3)), 0.0, 0.0, k == 1)
+        odometry.add(stamp_ns, Pose2(), after_break=state.broken)
+        again.take_odometry(state)
+        again.take_scan("front", Scan(stamp_ns, 0.0, BEARING, seen_from(place), 0.05, 20.0), odometry, Pose2())
+    assert again.is_placed()
+    assert math.hypot(again.map_from_odom().x_m - place.x_m, again.map_from_odom().y_m - place.y_m) < 0.1
