@@ -31,7 +31,10 @@ demo: venv  ## An emulated robot, the daemon and the live page; prints the addre
 	$(BIN)/umfeld demo $(ARGS)
 
 test: venv lint  ## Everything that must hold: lint, types, arrows, all tests
-	$(PYTEST) -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(PYTEST) -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS) || { \
+	  test $$? -eq 1 || exit 1; \
+	  echo "What failed beside other work is run once more, alone: whatever fails again fails the run."; \
+	  $(PYTEST) --last-failed --last-failed-no-failures none -x $(ARGS); }
 
 lint: venv  ## ruff, mypy strict, import-linter
 	$(BIN)/ruff check .

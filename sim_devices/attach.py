@@ -36,6 +36,7 @@ MOST_OWED = 65536
 OWED_NS = 250_000_000
 HOKUYO_TCP_PORT = 10940
 IDLE_NS = 50_000_000  # longest sleep
+STOP_S = 60.0  # a loop on a starved machine ends late; its wires must not be pulled out under it
 STEP_NS = 2_000_000  # step of a device that does not say when it wants the next one
 
 
@@ -555,7 +556,7 @@ class Attachment:
         self._ending.set()
         self.post(lambda: None)
         if self._thread is not None:
-            self._thread.join(timeout=5.0)
+            self._thread.join(timeout=STOP_S)
             self._thread = None
         for station in self._stations.values():
             station.close()

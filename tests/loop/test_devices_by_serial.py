@@ -51,6 +51,10 @@ class Room:
         raise AttributeError(name)
 
 
+def swap_paths(first: PtyLink, second: PtyLink) -> None:
+    first.path, second.path = second.path, first.path
+
+
 def test_two_lasers_of_a_kind_keep_their_names_when_plugged_in_the_other_order(tmp_path: Path) -> None:
     attachment = Attachment()
     links = {name: PtyLink(tmp_path / f"ttyACM{number}") for number, name in enumerate(("H0000001", "H0000002"))}
@@ -78,14 +82,13 @@ def test_two_lasers_of_a_kind_keep_their_names_when_plugged_in_the_other_order(t
         reader.start()
     try:
         wait_for("both lasers", lambda: all(len(scans) > 3 for scans in heard.values()))
-        for link in links.values():
-            link.close()
+        for name in links:
+            attachment.unplug(name)
         wait_for("the loss", lambda: not any(reader.health().is_open for reader in readers))
-        first, second = links.values()
-        first.path, second.path = second.path, first.path  # the other way round
+        attachment.post(lambda: swap_paths(*links.values()))
         before = {name: len(scans) for name, scans in heard.items()}
-        for link in (second, first):
-            link.open()
+        for name in links:
+            attachment.replug(name)
         wait_for("both lasers again", lambda: all(len(heard[name]) > before[name] + 3 for name in heard))
     finally:
         for reader in readers:
