@@ -21,7 +21,7 @@ from drivers.ports import CanPort, Port
 from drivers.reader import SourceHealth, WireReader
 from drivers.readings import DeviceEvent, LinkState, Reading
 from drivers.slcan_bus import LawicelBus
-from service import assemble
+from service import assemble, assemble_wires
 from service.config import Config, load
 from service.fusion import Fusion, OdometryOnly
 from service.outputs import HealthOut, Output, PolarOut
@@ -182,7 +182,7 @@ class Rig:
             beat=lambda now_ns: None,
             health=lambda now_ns: HealthOut(now_ns, 0, "", (), {}, {}),
         )
-        self.readers = [self._reader(wire) for wire in assemble.wires(self.config)]
+        self.readers = [self._reader(wire) for wire in assemble_wires.wires(self.config)]
 
     def __enter__(self) -> Rig:
         return self
@@ -252,7 +252,7 @@ class Rig:
 
     def link_of(self, source: str) -> MemoryLink:
         """The wire of a source."""
-        (wire,) = (wire for wire in assemble.wires(self.config) if source in wire.conversations)
+        (wire,) = (wire for wire in assemble_wires.wires(self.config) if source in wire.conversations)
         return self._link_of(wire)
 
     def is_running(self, source: str) -> bool:
@@ -281,7 +281,7 @@ class Rig:
         self.heard.append((source, item))
         self.worker.sink(source, item)
 
-    def _reader(self, wire: assemble.Wire) -> WireReader[Any]:
+    def _reader(self, wire: assemble_wires.Wire) -> WireReader[Any]:
         link = self._link_of(wire)
         name = str(link.path)
         on_tcp = wire.name in self.config.lasers and self.config.lasers[wire.name].driver == "sick_cola"
@@ -302,7 +302,7 @@ class Rig:
             wire.name, open_port, conversations, self._sink, clock=lambda: self.now_ns, wait=lambda seconds: None
         )
 
-    def _link_of(self, wire: assemble.Wire) -> MemoryLink:
+    def _link_of(self, wire: assemble_wires.Wire) -> MemoryLink:
         for link in self._links.values():
             if wire.port == str(link.path):
                 return link

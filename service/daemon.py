@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivers.reader import WireReader
 from mapping.frames import IDENTITY, Pose2
-from service import assemble, assemble_makers, health, recording
+from service import assemble, assemble_makers, assemble_wires, health, recording
 from service.background import Background
 from service.clock import Clock, SystemClock
 from service.config import Config, Loaded
@@ -144,7 +144,7 @@ class Daemon:
 
     def _start_parts(self) -> None:
         sys.setswitchinterval(_GIL_SWITCH_S)
-        config, wires = self._config, assemble.wires(self._config)
+        config, wires = self._config, assemble_wires.wires(self._config)
         claims = self._parts.enter_context(Claims())
         claims.claim_ports(wire.port for wire in wires if wire.port is not None)
         store = self._open_store()

@@ -10,7 +10,7 @@ from typing import Any
 
 from drivers.reader import SourceHealth, WireReader
 from drivers.readings import LinkState
-from service import assemble
+from service import assemble, assemble_wires
 from service.config import Config
 from service.errors import Trouble
 from service.health import identity_text, trouble_of
@@ -65,7 +65,7 @@ def check_devices(
     found: list[Found] = []
     opened: list[tuple[str, WireReader[Any]]] = []
     with Claims() as claims:
-        for wire in assemble.wires(config):
+        for wire in assemble_wires.wires(config):
             where = wire.port or wire.name
             try:
                 claims.claim_ports([wire.port] if wire.port is not None else [])

@@ -16,7 +16,7 @@ from typing import Any
 from drivers.conversation import SetBaudRate
 from drivers.errors import DriverError
 from drivers.ports import Clock, Port
-from service import assemble
+from service import assemble_wires
 from service.config import Config
 from service.config_devices import HokuyoLaser, RplidarLaser, SickLms2xxLaser
 from service.errors import Trouble
@@ -42,12 +42,12 @@ def stop_devices(config: Config, *, clock: Clock, sleep: Callable[[float], objec
     """Say farewell on every wire, side by side. A wire that a running daemon has is left to it."""
     speeds = {config.source_name(section, name): _speeds(device) for section, name, device in config.devices()}
     with ThreadPoolExecutor(max_workers=8) as pool:
-        answers = pool.map(lambda wire: _stop_wire(wire, speeds, clock, sleep), assemble.wires(config))
+        answers = pool.map(lambda wire: _stop_wire(wire, speeds, clock, sleep), assemble_wires.wires(config))
         return [told for answer in answers for told in answer]
 
 
 def _stop_wire(
-    wire: assemble.Wire, speeds: dict[str, tuple[int, ...]], clock: Clock, sleep: Callable[[float], object]
+    wire: assemble_wires.Wire, speeds: dict[str, tuple[int, ...]], clock: Clock, sleep: Callable[[float], object]
 ) -> list[Told]:
     farewells = {name: tuple(make().farewell()) for name, make in wire.conversations.items()}
     if not any(farewells.values()):

@@ -25,7 +25,7 @@ from drivers.readings import DeviceEvent, Reading
 from drivers.recording import WirePlayer, WireRecord, decode_record
 from mapping.frames import Pose2
 from mapping.grids.occupancy import OccupancyGrid
-from service import assemble
+from service import assemble, assemble_wires
 from service.background import at_once
 from service.clock import CrankedClock
 from service.config import Config, check
@@ -287,7 +287,7 @@ class Replay:
         self.pace: Pace = _ignore
         self._players = {
             wire.name: WirePlayer({name: make() for name, make in wire.conversations.items()})
-            for wire in assemble.wires(self.config)
+            for wire in assemble_wires.wires(self.config)
         }
         found = assemble.sensors(self.config)
         maps = assemble.maps(self.config, found)

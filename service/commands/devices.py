@@ -246,13 +246,13 @@ def _wait_for_hand(config: Config, seconds: float) -> Meant | None:
     import queue
 
     from drivers.readings import DeviceEvent, Reading
-    from service import assemble
+    from service import assemble_wires
     from service.identify import Watch
     from service.locks import Claims
 
     items: queue.SimpleQueue[tuple[str, Reading | DeviceEvent]] = queue.SimpleQueue()
     with Claims() as claims:
-        wires = assemble.wires(config)
+        wires = assemble_wires.wires(config)
         claims.claim_ports(wire.port for wire in wires if wire.port is not None)
         readers = [wire.reader(lambda name, item: items.put((name, item)), time.monotonic_ns) for wire in wires]
         for reader in readers:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.readings import ScanReading
-from service import assemble, detect
+from service import assemble_wires, detect
 from service.config import check
 from service.config_files import Layers
 from sim_devices.attach import Attachment, PtyLink
@@ -69,7 +69,7 @@ def test_two_lasers_of_a_kind_keep_their_names_when_plugged_in_the_other_order(t
         },
         "search": {"ports": [f"{tmp_path}/ttyACM*"]},
     }
-    wires = assemble.wires(check(Layers(data, {}, {}, ())))
+    wires = assemble_wires.wires(check(Layers(data, {}, {}, ())))
     assert [wire.port for wire in wires] == [None, None]
     heard: dict[str, list[float]] = {"left": [], "right": []}
 
@@ -100,7 +100,7 @@ def test_two_lasers_of_a_kind_keep_their_names_when_plugged_in_the_other_order(t
 
 def test_a_laser_that_is_not_there_is_told_by_its_number(tmp_path: Path) -> None:
     data = {"lasers": {"left": {"driver": "hokuyo", "serial": "H7"}}, "search": {"ports": [f"{tmp_path}/*"]}}
-    (wire,) = assemble.wires(check(Layers(data, {}, {}, ())))
+    (wire,) = assemble_wires.wires(check(Layers(data, {}, {}, ())))
     with pytest.raises(Exception, match=r"no device with serial number H7 .*plugged in"):
         wire.open_port(time.monotonic_ns)
 

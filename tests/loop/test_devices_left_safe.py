@@ -22,7 +22,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.reader import WireReader
-from service import assemble
+from service import assemble_wires
 from service.config import load
 from service.farewell import stop_devices
 from service.locks import Claims
@@ -87,7 +87,7 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
 
 def crashed(robot: Robot) -> None:
     """Bring the lasers up, then drop the lines without a word, as a killed daemon does."""
-    wires = assemble.wires(load(robot.config).config)
+    wires = assemble_wires.wires(load(robot.config).config)
     readers: list[WireReader[Any]] = [wire.reader(lambda _name, _item: None, time.monotonic_ns) for wire in wires]
     stopping = threading.Event()
 

@@ -26,7 +26,7 @@ from drivers.ports import CanPort
 from drivers.reader import SourceHealth, WireReader
 from drivers.readings import ChainReading, DeviceEvent, LinkState, RangeStatus, Reading, ScanReading, WheelReading
 from mapping.sectors.snapshot import PolarSnapshot, SectorState
-from service import assemble
+from service import assemble, assemble_wires
 from service.config import Config, load
 from service.fusion import Fusion, OdometryOnly
 from service.outputs import HealthOut, OdomOut, Output, PolarOut
@@ -140,7 +140,7 @@ class Rig:
             beat=lambda now_ns: None,
             health=lambda now_ns: HealthOut(now_ns, 0, "", (), {}, {}),
         )
-        (wire,) = assemble.wires(self.config)
+        (wire,) = assemble_wires.wires(self.config)
         self.reader: WireReader[Any] = wire.reader(self._sink, self.clock)
 
     def _attach(self, table: Table) -> Table:

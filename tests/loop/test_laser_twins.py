@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from drivers.readings import DeviceEvent, LinkState, Reading, ScanReading
-from service.assemble import wires
+from service.assemble_wires import wires
 from service.config import load
 from tests.waiting import GIVE_UP_S, wait_for
 

@@ -14,7 +14,7 @@ from jsonschema import Draft202012Validator
 
 from drivers.alice import AliceConversation
 from mapping.topology.alice import AliceMap
-from service import assemble, assemble_makers
+from service import assemble_makers, assemble_wires
 from service.alice_maker import AliceMaker
 from service.config import Config
 from service.errors import WrongUsage
@@ -127,7 +127,7 @@ def test_gap_is_no_way() -> None:
 
 def test_configured_robot_is_put_together() -> None:
     config = Config.model_validate(CONFIG)
-    assert isinstance(assemble.conversation_of(config.rings["body"]), AliceConversation)
+    assert isinstance(assemble_wires.conversation_of(config.rings["body"]), AliceConversation)
     assert [maker.name for maker in assemble_makers.map_makers(config, {"body": Ring("body")})] == ["alice"]
 
 

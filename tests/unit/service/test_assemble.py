@@ -12,7 +12,7 @@ from drivers.encoder_cia406 import Cia406PairConversation
 from drivers.laser_hokuyo import HokuyoConversation
 from drivers.sonar_usboard import UsBoardConversation, UsBoardSerialConversation
 from mapping.frames import Pose2
-from service import assemble
+from service import assemble, assemble_wires
 from service.config import Config, load
 from service.fusion import Fusion, OdometryOnly
 from service.outputs import GridOut, PolarOut, RectOut
@@ -72,7 +72,7 @@ def config(tmp_path: Path) -> Config:
 
 
 def test_every_wire_appears_once_with_everyone_on_it(config: Config) -> None:
-    wires = {wire.name: wire for wire in assemble.wires(config)}
+    wires = {wire.name: wire for wire in assemble_wires.wires(config)}
     assert {name: (wire.port, sorted(wire.conversations)) for name, wire in wires.items()} == {
         "front": ("/dev/null1", ["front"]),
         "rear": ("/dev/null2", ["rear"]),
@@ -93,7 +93,7 @@ def test_a_bus_of_the_system_has_no_port_of_its_own(config: Config) -> None:
     changed = config.model_copy(
         update={"can": {"main": config.can["main"].model_copy(update={"interface": "socketcan"})}}
     )
-    assert {wire.name: wire.port for wire in assemble.wires(changed)}["can-main"] is None
+    assert {wire.name: wire.port for wire in assemble_wires.wires(changed)}["can-main"] is None
 
 
 def test_sensors_sit_where_they_were_mounted(config: Config) -> None:

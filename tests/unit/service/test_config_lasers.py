@@ -16,7 +16,8 @@ from drivers.laser_rplidar import RplidarConversation
 from drivers.laser_sick_cola import SickColaConversation
 from drivers.laser_sick_lms2xx import SickLms2xxConversation
 from drivers.ports import SerialPort, TcpPort
-from service.assemble import conversation_of, sensors, wires
+from service.assemble import sensors
+from service.assemble_wires import conversation_of, wires
 from service.config import Config, load
 from service.config_devices import tcp_address
 from service.errors import WrongUsage

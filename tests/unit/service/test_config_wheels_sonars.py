@@ -11,7 +11,8 @@ from drivers.encoder_roboclaw import RoboClawConversation
 from drivers.encoder_vesc import VescPairConversation
 from drivers.readings import ChainReading, LinkState, Reading, WheelReading
 from drivers.sonar_maxbotix import MaxBotixConversation
-from service.assemble import conversation_of, sensors, wires
+from service.assemble import sensors
+from service.assemble_wires import conversation_of, wires
 from service.config import Config, load
 from service.errors import WrongUsage
 from service.sensors import Chain, Wheels

@@ -12,7 +12,7 @@ from drivers.readings import ContactLine, ContactReading, ContactState, PoseRead
 from mapping.frames import Pose2
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.sectors.snapshot import SectorState
-from service import assemble
+from service import assemble, assemble_wires
 from service.config import Config, load
 from service.errors import WrongUsage
 from service.fusion import Fusion, Parts, Touch
@@ -58,7 +58,7 @@ def read(folder: Path, text: str) -> Config:
 def test_switches_share_the_board_and_feed_maps(tmp_path: Path) -> None:
     wheels = '[wheels.drive]\ndriver = "arduino-bridge"\nport = "/dev/ttyUSB0"\n[drive]\nsource = "drive"\n'
     config = read(tmp_path, BUMPERS + wheels + '[sectors.polar.near]\nsources = ["contacts.bumpers"]\n')
-    (wire,) = assemble.wires(config)
+    (wire,) = assemble_wires.wires(config)
     assert set(wire.conversations) == {"bumpers", "drive"}
     found = assemble.sensors(config)
     contacts = found["bumpers"]
@@ -73,7 +73,7 @@ def test_switches_share_the_board_and_feed_maps(tmp_path: Path) -> None:
 @pytest.mark.parametrize("base_id", ["0x400", "0x420"])
 def test_switches_of_a_usboard_stand_with_its_sonars_or_alone(tmp_path: Path, base_id: str) -> None:
     config = read(tmp_path, USBOARD.replace("0x420", base_id))
-    (wire,) = assemble.wires(config)
+    (wire,) = assemble_wires.wires(config)
     assert set(wire.conversations) == {"bumpers", "ring"}
     asked = []
     for make in wire.conversations.values():
