@@ -23,6 +23,9 @@ from service.errors import Trouble
 from service.locks import Claims
 
 _MOMENT_S = 0.06
+_SILENT_S = 0.4  # longer than any laser here takes from one answer to the next
+_DRAINED_NS = 2_000_000_000  # what a system keeps for a reader has come by then
+_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +62,43 @@ def _stop_wire(
         except (Trouble, DriverError) as error:
             return [Told(name, 0, str(error)) for name in farewells]
         try:
-            return [_say(port, name, items, speeds.get(name, ()), sleep) for name, items in farewells.items()]
+            return [
+                _convince(port, name, items, speeds.get(name, ()), clock, sleep) for name, items in farewells.items()
+            ]
         finally:
             port.close()
+
+
+def _convince(
+    port: Port[Any],
+    name: str,
+    items: Sequence[Any],
+    speeds: tuple[int, ...],
+    clock: Clock,
+    sleep: Callable[[float], object],
+) -> Told:
+    """Say it, and say it again to a laser on a serial line that is heard afterwards."""
+    said = 0
+    for _ in range(_ROUNDS):
+        told = _say(port, name, items, speeds, sleep)
+        said += told.items
+        if told.trouble or not speeds:
+            return Told(name, said, told.trouble)
+        try:
+            if _falls_silent(port, clock):
+                return Told(name, said)
+        except DriverError as error:
+            return Told(name, said, str(error))
+    return Told(name, said, "it goes on sending after it was told to stop at each of its speeds: switch off its power")
+
+
+def _falls_silent(port: Port[Any], clock: Clock) -> bool:
+    """Whether nothing comes for a while, once what the system kept has been read."""
+    until_ns = clock() + _DRAINED_NS
+    while clock() < until_ns:
+        if not port.read(_SILENT_S):
+            return True
+    return False
 
 
 def _say(

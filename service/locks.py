@@ -17,6 +17,14 @@ from types import TracebackType
 from service.errors import Trouble
 
 
+class Held(Trouble):
+    """Another process has the name. pid: which, "unknown" if it does not say."""
+
+    def __init__(self, message: str, pid: str) -> None:
+        super().__init__(message)
+        self.pid = pid
+
+
 class Claims:
     """Names this process holds until close(); a context manager."""
 
@@ -26,14 +34,21 @@ class Claims:
     def claim_ports(self, ports: Iterable[str]) -> None:
         """Take serial ports for this daemon; Trouble names the process that has one already, and the repair."""
         for port in ports:
+            refusal = (
+                f"{port} is in use by another umfeld daemon (process {{pid}}): stop that one, or give this "
+                "configuration a port of its own"
+            )
             # Under its own name too: a daemon that waits for its device claims it before the link leads anywhere.
-            for name in {os.path.abspath(port): None, os.path.realpath(port): None}:
-                self._claim(
-                    "port",
-                    name,
-                    f"{port} is in use by another umfeld daemon (process {{pid}}): stop that one, or give this "
-                    "configuration a port of its own",
-                )
+            self._claim("port", os.path.abspath(port), refusal)
+            self._claim_device(os.path.realpath(port), refusal)
+
+    def _claim_device(self, device: str, refusal: str) -> None:
+        """What a name leads to. A holder that lost it has no say: the number may be another plug's by now."""
+        try:
+            self._claim("device", device, refusal)
+        except Held as held:
+            if not os.path.exists(device) or _has_open(held.pid, device):
+                raise
 
     def claim_store(self, path: Path) -> None:
         """Take the file of a map."""
@@ -56,7 +71,8 @@ class Claims:
             holder.listen(1024)  # nobody accepts: every refused daemon takes a place
         except OSError as error:
             holder.close()
-            raise Trouble(refusal.format(pid=_holder_of(address))) from error
+            pid = _holder_of(address)
+            raise Held(refusal.format(pid=pid), pid) from error
         self._sockets.append(holder)
 
     def close(self) -> None:
@@ -84,3 +100,12 @@ def _holder_of(address: str) -> str:
             return "unknown"
     pid, _uid, _gid = struct.unpack("3i", credentials)
     return str(pid)
+
+
+def _has_open(pid: str, device: str) -> bool:
+    """Whether a process has a device open; True where that cannot be seen."""
+    folder = Path("/proc") / pid / "fd"
+    try:
+        return any(os.path.realpath(each) == device for each in folder.iterdir())
+    except OSError:
+        return True

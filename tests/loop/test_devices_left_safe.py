@@ -59,13 +59,25 @@ class Room:
         return 0.0, 0.0
 
 
+class Deaf(RpLidar):
+    """Loses what it is told after it began to scan: `deaf_for` reads of it, None for ever."""
+
+    deaf_for: int | None = 0
+
+    def step(self, now_ns: int, received: bytes, baud: int | None = None) -> bytes:
+        if received and self.is_scanning and self.deaf_for != 0:
+            self.deaf_for = None if self.deaf_for is None else self.deaf_for - 1
+            received = b""
+        return super().step(now_ns, received, baud)
+
+
 class Robot:
     """Two lasers on ptys and a configuration that names them."""
 
     def __init__(self, folder: Path) -> None:
         self.rooms = {"front": Room(), "rear": Room()}
         self.front = HokuyoLaser(self.rooms["front"], spin_up_s=0.1)
-        self.rear = RpLidar(self.rooms["rear"])
+        self.rear = Deaf(self.rooms["rear"])
         self.attachment = Attachment()
         self.attachment.add("front", self.front, PtyLink(folder / "front"))
         self.attachment.add("rear", self.rear, PtyLink(folder / "rear"))
@@ -124,6 +136,17 @@ def test_after_a_crash_stop_leaves_every_laser_dark(robot: Robot) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert [each["name"] for each in json.loads(done.stdout)] == ["front", "rear"]
     wait_for("darkness", lambda: not robot.front.laser_is_on and not robot.rear.is_scanning)
+
+
+@pytest.mark.parametrize("deaf_for", [1, None], ids=["for a moment", "for ever"])
+def test_a_laser_that_did_not_hear_is_told_again(robot: Robot, deaf_for: int | None) -> None:
+    crashed(robot)
+    robot.rear.deaf_for = deaf_for
+    front, rear = stop_devices(load(robot.config).config, clock=time.monotonic_ns)
+    wait_for("darkness", lambda: not robot.front.laser_is_on)
+    assert not front.trouble
+    assert ("goes on sending" in rear.trouble) == (deaf_for is None)
+    assert robot.rear.is_scanning == (deaf_for is None)
 
 
 @pytest.mark.parametrize(

@@ -182,6 +182,22 @@ def test_a_port_belongs_to_one_daemon(tmp_path: Path) -> None:
         third.claim_ports([str(alias)])
 
 
+def test_a_device_is_taken_from_a_daemon_that_lost_it_but_not_from_one_that_has_it(tmp_path: Path) -> None:
+    """Numbers are given anew: /dev/ttyACM0, open under one link, is another adapter after both were replugged."""
+    device = tmp_path / "ttyACM0"
+    device.touch()
+    for link in ("one", "other"):
+        (tmp_path / link).symlink_to(device)
+    with Claims() as first:
+        first.claim_ports([str(tmp_path / "one")])
+        with device.open(), Claims() as second, pytest.raises(Trouble, match="in use by another"):
+            second.claim_ports([str(tmp_path / "other")])
+        with Claims() as second:
+            second.claim_ports([str(tmp_path / "other")])
+        with Claims() as second, pytest.raises(Trouble, match="in use by another"):
+            second.claim_ports([str(tmp_path / "one")])  # the same name is the same device to both
+
+
 def test_a_killed_daemon_leaves_no_lock(tmp_path: Path) -> None:
     code = """
 import sys, time
