@@ -9,7 +9,9 @@
 
 Beams run from right to left. FLASER does not say its field of view: 180 degrees unless the number of beams tells of
 another (`field_of_beams`). Old programs wrote even counts for SICKs (180, 360) that leave out +90 degrees.
-Of several lasers in one log the one with the most scans is read. Odd lines are counted by reason and skipped.
+Of several lasers in one log the one with the most scans is read; one that is told without poses (RAWLASER beside
+ROBOTLASER) only if it has twice as many. Where scans have no poses of their own, or poses that never move, the robot is
+where ODOM lines have it at their stamps. Odd lines are counted by reason and skipped.
 Source: the format comments at the head of CARMEN's own logs.
 """
 
@@ -36,6 +38,7 @@ from drivers.logs.log import (
     no_echo_threshold,
     odometry_from,
     path_of,
+    posed_by,
     read_lines,
     timed,
     without_echo_from,
@@ -82,9 +85,12 @@ def read_carmen(path: Path, *, no_echo_m: float | None = None, poses: PoseKind |
     threshold = no_echo_m if no_echo_m is not None else no_echo_threshold(ranges, found.declared_max_m)
     kind = poses or _pose_kind(path, found)
     scans, repaired, made_up = timed(without_echo_from(measured, threshold))
+    odometry = _own_odometry(found, kind, made_up)
+    if not _moves(scans):
+        scans = posed_by(scans, odometry)
     return Log(
         scans=tuple(scans),
-        odometry=path_of(scans, _own_odometry(found, kind, made_up)),
+        odometry=path_of(scans, odometry),
         poses=kind,
         robot_from_laser=mounting_of([s.robot_pose for s in scans], [s.laser_pose for s in scans]),
         range_max_m=_range_max(scans, threshold, found.declared_max_m),
@@ -224,7 +230,7 @@ def field_of_beams(n: int) -> F64:
 
 
 def _principal_laser(found: _Gathered) -> list[LogScan]:
-    name = max(found.scans, key=lambda k: len(found.scans[k]))
+    name = max(found.scans, key=lambda k: len(found.scans[k]) * (1 if k.startswith("RAWLASER") else 2))
     for other, scans in found.scans.items():
         if other != name:
             found.skipped[f"other_laser_{other.lower()}"] += len(scans)
@@ -234,6 +240,11 @@ def _principal_laser(found: _Gathered) -> list[LogScan]:
 def _pose_kind(path: Path, found: _Gathered) -> PoseKind:
     corrected = found.particle_filter_lines > 0 or "corrected" in path.name.lower()
     return PoseKind.CORRECTED if corrected else PoseKind.ODOMETRY
+
+
+def _moves(scans: Sequence[LogScan]) -> bool:
+    first = scans[0].robot_pose
+    return any(scan.robot_pose != first for scan in scans)
 
 
 def _own_odometry(found: _Gathered, kind: PoseKind, made_up: bool) -> Odometry:

@@ -389,8 +389,31 @@ def path_of(scans: Sequence[LogScan], odometry: Odometry) -> Odometry:
 
     Not a mixture: scans often carry a pose that is a little old, and a mixture would go to and fro.
     """
-    first, last = scans[0].stamp_s, scans[-1].stamp_s
-    dense = len(odometry) >= 0.5 * len(scans)
-    if dense and odometry.stamp_s[0] - first < 5.0 and last - odometry.stamp_s[-1] < 5.0:
+    if _spans(odometry, scans):
         return odometry
     return odometry_from([s.stamp_s for s in scans], [s.robot_pose for s in scans])
+
+
+def _spans(odometry: Odometry, scans: Sequence[LogScan]) -> bool:
+    """Whether odometry is about as dense as the scans and spans them."""
+    first, last = scans[0].stamp_s, scans[-1].stamp_s
+    dense = len(odometry) >= 0.5 * len(scans)
+    return dense and bool(odometry.stamp_s[0] - first < 5.0 and last - odometry.stamp_s[-1] < 5.0)
+
+
+def posed_by(scans: Sequence[LogScan], odometry: Odometry) -> list[LogScan]:
+    """Scans with the robot where odometry has it at their stamps, the laser on the robot as before; as they are if
+    odometry does not span them."""
+    if len(odometry) < 2 or not _spans(odometry, scans):
+        return list(scans)
+    stamps = np.array([scan.stamp_s for scan in scans])
+    x, y, yaw = (np.interp(stamps, odometry.stamp_s, column) for column in _unwrapped(odometry.pose).T)
+    robot = zip(x.tolist(), y.tolist(), ((yaw + np.pi) % (2.0 * np.pi) - np.pi).tolist())
+    return [
+        replace(scan, robot_pose=pose, laser_pose=compose(pose, mounting_of([scan.robot_pose], [scan.laser_pose])))
+        for scan, pose in zip(scans, robot)
+    ]
+
+
+def _unwrapped(poses: F64) -> F64:
+    return np.column_stack((poses[:, :2], np.unwrap(poses[:, 2])))

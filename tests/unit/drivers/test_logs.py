@@ -59,6 +59,45 @@ def test_carmen_lines(tmp_path: Path, packed: bool) -> None:
     assert log.skipped == {"param": 1}
 
 
+def rawlaser(ranges: list[float], stamp: float) -> str:
+    told = " ".join(f"{r:.2f}" for r in ranges)
+    return f"RAWLASER1 0 -1.570796 3.141593 0.017453 81.9 0.01 0 {len(ranges)} {told} 0 {stamp:.6f} host 0"
+
+
+def odom(x: float, yaw: float, stamp: float) -> str:
+    return f"ODOM {x} 2.0 {yaw} 0 0 0 {stamp:.6f} host 0"
+
+
+def test_scans_without_poses_lie_where_odometry_is(tmp_path: Path) -> None:
+    lines = [line for k in range(5) for line in (odom(0.5 * k, 3.1 + 0.1 * k, k), rawlaser([2.0] * 181, k + 0.5))]
+    log = read_log(written(tmp_path, *lines, odom(2.5, 3.6, 5.0)))
+    found = np.array([scan.robot_pose for scan in log.scans])
+    np.testing.assert_allclose(found[:, 0], 0.25 + 0.5 * np.arange(5))
+    turned = 3.15 + 0.1 * np.arange(5)
+    np.testing.assert_allclose(found[:, 2], np.where(turned > math.pi, turned - 2.0 * math.pi, turned), atol=1e-12)
+    assert log.robot_from_laser == (0.0, 0.0, 0.0)
+    assert np.isfinite(log.scans[0].range_m).all()
+
+
+def test_poses_that_never_move_are_replaced_by_odometry(tmp_path: Path) -> None:
+    still = [flaser([2.0] * 180, k, laser="0.2 0.0 0.0", robot="0.0 0.0 0.0") for k in range(4)]
+    log = read_log(written(tmp_path, *still, *(odom(0.5 * k, 0.0, k) for k in range(4))))
+    np.testing.assert_allclose([scan.robot_pose[0] for scan in log.scans], [0.0, 0.5, 1.0, 1.5])
+    assert log.robot_from_laser == (0.2, 0.0, 0.0)
+
+
+def test_of_one_laser_told_twice_the_lines_with_poses_are_read(tmp_path: Path) -> None:
+    posed = (
+        "ROBOTLASER1 0 -1.570796 3.141593 0.017453 81.9 0.01 0 3 1.5 2.0 2.5 0 "
+        "5.2 1.0 0.0 5.0 1.0 0.0 0 0 0 0 0 {} host 0.1"
+    )
+    lines = [line for k in range(3) for line in (rawlaser([1.5, 2.0, 2.5], k), posed.format(k))]
+    log = read_log(written(tmp_path, *lines, rawlaser([1.5, 2.0, 2.5], 3)))
+    assert len(log.scans) == 3
+    assert log.robot_from_laser == (0.2, 0.0, 0.0)
+    assert log.skipped == {"other_laser_rawlaser1": 4}
+
+
 def test_robotlaser_says_its_field_offset_and_limit(tmp_path: Path) -> None:
     line = (
         "ROBOTLASER1 0 -1.570796 3.141593 0.017453 20.0 0.01 0 3 1.5 20.0 20.5 2 7 8 "
