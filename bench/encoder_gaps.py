@@ -21,9 +21,10 @@ from drivers.encoder_cia406 import Cia406PairConversation
 from drivers.ports import CanPort
 from drivers.reader import WireReader
 from drivers.readings import DeviceEvent, LinkState, Reading
-from sim_devices.attach import Attachment, PtyLink
+from sim_devices.attach import Attachment
 from sim_devices.device import F64, Mount
 from sim_devices.encoder_cia406 import Cia406Encoder
+from sim_devices.pty_link import PtyLink
 from sim_devices.slcan_hub import CanBus, CanBusStation
 
 LEFT, RIGHT = 0x20, 0x21

@@ -57,11 +57,12 @@ class Figure:
 def robot(folder: Path) -> int:
     """Emulate ARTOS until SIGTERM; then write when the last byte of each scan had gone out, monotonic nanoseconds."""
     from sim_devices import __main__ as simulation
-    from sim_devices import attach, presets
+    from sim_devices import presets
+    from sim_devices.pty_link import PtyLink
 
     ended: list[int] = []
 
-    class TimedLink(attach.PtyLink):
+    class TimedLink(PtyLink):
         """Notes when a whole scan has gone out. Other replies end alike, but come before the first scan only."""
 
         def write(self, data: bytes) -> int:

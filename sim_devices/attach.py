@@ -5,48 +5,31 @@ A station is what the loop serves: a device on its link here, a whole CAN bus in
 stations; others talk to it through `post`. The loop sleeps until a host sends something or a device has something due.
 
 A pty carries no modem lines and no pace of its own; the devices keep the wire's time. Its queue holds about 20 KB: what
-does not fit is dropped and counted, as an overrun would. The slave stays open here, or reads would fail between hosts.
+does not fit is dropped and counted, as an overrun would.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
 import os
 import queue
 import select
 import socket
-import struct
-import termios
 import threading
 import time
-import tty
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from sim_devices.device import ByteDevice
+from sim_devices.pty_link import READ_SIZE, LinkCounters, PtyLink
 
-TCGETS2 = 0x802C542A
-TERMIOS2 = struct.Struct("4IB19s2I")  # flags, line discipline, control characters, input and output speed
-READ_SIZE = 65536
 MOST_OWED = 65536
 OWED_NS = 250_000_000
 HOKUYO_TCP_PORT = 10940
 IDLE_NS = 50_000_000  # longest sleep
 STOP_S = 60.0  # a loop on a starved machine ends late; its wires must not be pulled out under it
 STEP_NS = 2_000_000  # step of a device that does not say when it wants the next one
-
-
-@dataclass(slots=True)
-class LinkCounters:
-    """What went over a link since it was made."""
-
-    received_bytes: int = 0
-    sent_bytes: int = 0
-    dropped_bytes: int = 0
 
 
 class Link(Protocol):
@@ -76,109 +59,6 @@ class Link(Protocol):
 
     def write(self, data: bytes) -> int:
         """Send without waiting; what does not fit is dropped and counted. Returns how many bytes went out."""
-
-
-class PtyLink:
-    """A pty published by a symbolic link, so that a replugged device comes back under its name.
-
-    path: the symbolic link, made with its folders and removed by close(). An existing symbolic link is replaced;
-    anything else there is left alone and raises FileExistsError.
-    """
-
-    def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
-        self.counters = LinkCounters()
-        self._name = self.path.name
-        self._suffix = ""
-        self._master: int | None = None
-        self._slave: int | None = None
-        self.open()
-
-    @property
-    def is_open(self) -> bool:
-        return self._master is not None
-
-    @property
-    def baud(self) -> int | None:
-        if self._master is None:
-            return None
-        with contextlib.suppress(OSError):
-            speed: int = TERMIOS2.unpack(fcntl.ioctl(self._master, TCGETS2, bytes(TERMIOS2.size)))[-1]
-            return speed
-        return None
-
-    @property
-    def tty(self) -> str | None:
-        """The name of the terminal behind the symbolic link."""
-        return None if self._slave is None else os.ttyname(self._slave)
-
-    def open(self) -> None:
-        if self._master is not None:
-            return
-        if self.path.exists() and not self.path.is_symlink():
-            raise FileExistsError(f"{self.path} exists and is no link of ours; choose another folder")
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)  # default settings echo: the emulator would hear itself
-        os.set_blocking(self._master, False)
-        fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
-        fresh.unlink(missing_ok=True)
-        fresh.symlink_to(os.ttyname(self._slave))
-        fresh.replace(self.path)
-
-    def rename(self, suffix: str) -> None:
-        """Come back under another name: the first one with a suffix; none for the first one. Unplugs if it changes."""
-        if suffix == self._suffix:  # asked at every service: making a path would cost more than the device
-            return
-        self.close()
-        self._suffix = suffix
-        self.path = self.path.with_name(self._name + suffix)
-
-    def obstruct(self, *, busy: bool, denied: bool) -> None:
-        """Let programs that ask for the port find it held by another (busy) or not permitted (root still may)."""
-        if self._slave is None:
-            return
-        fcntl.flock(self._slave, fcntl.LOCK_EX | fcntl.LOCK_NB if busy else fcntl.LOCK_UN)
-        fcntl.ioctl(self._slave, termios.TIOCEXCL if busy else termios.TIOCNXCL)
-        os.chmod(os.ttyname(self._slave), 0o000 if denied else 0o620)
-
-    def close(self) -> None:
-        if self._master is None or self._slave is None:
-            return
-        with contextlib.suppress(OSError):
-            if os.readlink(self.path) == os.ttyname(self._slave):
-                self.path.unlink()
-        os.close(self._slave)
-        os.close(self._master)  # hangs up: the host reads end of file or EIO
-        self._master = self._slave = None
-
-    def files(self) -> list[int]:
-        return [] if self._master is None else [self._master]
-
-    def read(self) -> bytes:
-        if self._master is None:
-            return b""
-        try:
-            data = os.read(self._master, READ_SIZE)
-        except OSError as error:
-            if error.errno in (errno.EAGAIN, errno.EIO):
-                return b""
-            raise
-        self.counters.received_bytes += len(data)
-        return data
-
-    def write(self, data: bytes) -> int:
-        sent = 0
-        if self._master is not None:
-            try:
-                while sent < len(data):
-                    sent += os.write(self._master, data[sent:])
-            except OSError as error:
-                if error.errno not in (errno.EAGAIN, errno.EIO):
-                    raise
-        self.counters.sent_bytes += sent
-        self.counters.dropped_bytes += len(data) - sent
-        return sent
 
 
 class TcpLink:

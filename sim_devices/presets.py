@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sim_devices.alice import Alice
-from sim_devices.attach import Attachment, MemoryLink, PtyLink, TcpLink
+from sim_devices.attach import Attachment, MemoryLink, TcpLink
 from sim_devices.contact import Bumper, Cliff, Contact
 from sim_devices.device import ByteDevice, CanDevice, Mount, Scene
 from sim_devices.encoder_arduino_bridge import ArduinoBridge, Pin, Sonar
@@ -27,6 +27,7 @@ from sim_devices.faults import FaultPlan
 from sim_devices.laser_hokuyo import LaserProfile
 from sim_devices.lasers import FIRST_MODEL, MODELS, make_laser
 from sim_devices.mount_nodding import SolidScene, Swing, TiltedScene, angle_encoder
+from sim_devices.pty_link import PtyLink
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.sonar_maxbotix import FAMILIES, MaxBotix, TextMultiplexer
 from sim_devices.sonar_usboard import ANALOG_ON, Transducer, UsBoard, UsBoardCan, UsBoardSerial, default_parameters

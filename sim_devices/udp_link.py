@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 
-from sim_devices.attach import READ_SIZE, LinkCounters
+from sim_devices.pty_link import READ_SIZE, LinkCounters
 
 LARGEST_DATAGRAM = 1400  # bytes; longer writes are cut
 

@@ -40,13 +40,14 @@ from drivers.laser_sick_cola import SickColaConversation
 from drivers.ports import TcpPort
 from drivers.reader import SourceHealth, WireReader
 from drivers.readings import ScanReading
-from sim_devices.attach import Attachment, PtyLink, TcpLink
+from sim_devices.attach import Attachment, TcpLink
 from sim_devices.device import F64, ByteDevice, Mount
 from sim_devices.laser_hokuyo import PROFILES, HokuyoLaser
 from sim_devices.laser_ldrobot import LdLidar
 from sim_devices.laser_rplidar import RPLIDAR_PROFILES, RpLidar
 from sim_devices.laser_sick_cola import COLA_PROFILES, SickColaLaser
 from sim_devices.laser_sick_lms2xx import SickLms2xxLaser
+from sim_devices.pty_link import PtyLink
 
 NOISE_M = (
     0.02  # mean error of a reader that reads right: the lasers' noise, and angles rounded to an eighth of a degree

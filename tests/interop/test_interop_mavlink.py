@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_devices.attach import Attachment, PtyLink
+from sim_devices.attach import Attachment
 from sim_devices.device import F64, Mount
 from sim_devices.mavlink_autopilot import MavlinkAutopilot, Rangefinder
+from sim_devices.pty_link import PtyLink
 from sim_devices.udp_link import UdpLink
 from tests.waiting import GIVE_UP_S, wait_for
 

@@ -25,12 +25,13 @@ from drivers.encoder_odrive import ODrivePairConversation
 from drivers.ports import CanPort
 from drivers.reader import WireReader
 from drivers.readings import DeviceEvent, Reading, WheelReading
-from sim_devices.attach import Attachment, PtyLink
+from sim_devices.attach import Attachment
 from sim_devices.device import F64, Mount
 from sim_devices.encoder_arduino_bridge import ArduinoBridge, Sonar
 from sim_devices.encoder_cia406 import Cia406Encoder
 from sim_devices.encoder_odrive import ODriveAxis
 from sim_devices.encoder_roboclaw import RoboClaw
+from sim_devices.pty_link import PtyLink
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.wheel import Side, Wheel
 from tests.waiting import GIVE_UP_S, SteadyClock, wait_for

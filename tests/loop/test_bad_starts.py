@@ -20,9 +20,10 @@ import numpy as np
 import pytest
 
 from service.store import MapStore
-from sim_devices.attach import Attachment, PtyLink
+from sim_devices.attach import Attachment
 from sim_devices.device import F64, ByteDevice, Mount
 from sim_devices.laser_hokuyo import UTM_30LX, HokuyoLaser
+from sim_devices.pty_link import PtyLink
 from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardSerial
 from tests.waiting import GIVE_UP_S, START_S, free_port, wait_for
 

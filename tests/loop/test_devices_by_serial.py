@@ -14,7 +14,7 @@ from drivers.readings import ScanReading
 from service import assemble_wires, detect
 from service.config import check
 from service.config_files import Layers
-from sim_devices.attach import Attachment, PtyLink
+from sim_devices.attach import Attachment
 from sim_devices.device import Mount
 from sim_devices.encoder_arduino_bridge import ArduinoBridge
 from sim_devices.encoder_roboclaw import RoboClaw
@@ -23,6 +23,7 @@ from sim_devices.laser_ldrobot import LdLidar
 from sim_devices.laser_rplidar import RpLidar
 from sim_devices.laser_sick_lms2xx import SickLms2xxLaser
 from sim_devices.mavlink_autopilot import MavlinkAutopilot
+from sim_devices.pty_link import PtyLink
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.sonar_maxbotix import MaxBotix
 from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardSerial

@@ -26,10 +26,11 @@ from service import assemble_wires
 from service.config import load
 from service.farewell import stop_devices
 from service.locks import Claims
-from sim_devices.attach import Attachment, PtyLink
+from sim_devices.attach import Attachment
 from sim_devices.device import Mount
 from sim_devices.laser_hokuyo import HokuyoLaser
 from sim_devices.laser_rplidar import RpLidar
+from sim_devices.pty_link import PtyLink
 from tests.waiting import GIVE_UP_S, START_S, free_port, wait_for
 
 F64 = NDArray[np.float64]

@@ -32,11 +32,12 @@ from service.fusion import Fusion, OdometryOnly
 from service.outputs import HealthOut, OdomOut, Output, PolarOut
 from service.warm_up import warm_up
 from service.worker import Worker
-from sim_devices.attach import Attachment, Link, PtyLink
+from sim_devices.attach import Attachment, Link
 from sim_devices.device import F64, Frame, Mount
 from sim_devices.faults import Fault, FaultPlan
 from sim_devices.laser_hokuyo import PROFILES
 from sim_devices.presets import HOST, Table, emulate, preset, to_toml
+from sim_devices.pty_link import PtyLink
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from tests.waiting import GIVE_UP_S, BeatStation, SteadyClock, wait_for, waited_ns
 

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 import serial
 
-from sim_devices.attach import Attachment, PtyLink
+from sim_devices.attach import Attachment
 from sim_devices.device import F64, Mount
 from sim_devices.encoder_cia406 import Cia406Encoder
 from sim_devices.faults import FaultPlan
 from sim_devices.laser_hokuyo import URG_04LX, UTM_30LX, HokuyoLaser
+from sim_devices.pty_link import PtyLink
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.sonar_usboard import Transducer, board_with
 from tests.waiting import GIVE_UP_S, SteadyClock, wait_for

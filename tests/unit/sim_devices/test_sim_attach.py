@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import socket
 import stat
 import termios
@@ -14,7 +15,8 @@ import numpy as np
 import pytest
 import serial
 
-from sim_devices.attach import Attachment, MemoryLink, PtyLink, TcpLink
+from sim_devices.attach import Attachment, MemoryLink, TcpLink
+from sim_devices.pty_link import PtyLink
 from tests.waiting import GIVE_UP_S, SteadyClock, wait_for, wait_for_input
 
 
@@ -62,10 +64,36 @@ def test_line_speed_of_the_host_is_seen(tmp_path: Path, baud: int) -> None:
 
 def test_full_queue_drops_and_counts(tmp_path: Path) -> None:
     link = PtyLink(tmp_path / "p")
+    host = os.open(link.path, os.O_RDWR | os.O_NOCTTY)
     sent = sum(link.write(bytes(1000)) for _ in range(60))
     assert sent == link.counters.sent_bytes
     assert 0 < sent < 60_000
     assert link.counters.dropped_bytes == 60_000 - sent
+    os.close(host)
+    link.close()
+
+
+def test_a_port_that_nobody_has_open_hears_nothing(tmp_path: Path) -> None:
+    """As a serial port: its next host finds neither what was said to nobody nor what the last one left unread."""
+    link = PtyLink(tmp_path / "p")
+    assert link.write(b"good morning") == 12
+    assert link.counters.unheard_bytes == 12
+    first = os.open(link.path, os.O_RDWR | os.O_NOCTTY)
+    another = os.open(link.path, os.O_RDWR | os.O_NOCTTY)
+    os.close(another)
+    link.write(b"left unread")
+    wait_for_input(first, len(b"left unread"))
+    os.close(first)
+    with serial.Serial(str(link.path), timeout=GIVE_UP_S) as host:  # before the device says anything again
+        link.read()
+        link.write(b"heard")
+        assert host.read(5) == b"heard"
+    link.write(b"to nobody")
+    assert link.counters.unheard_bytes == 21
+    assert link.counters.sent_bytes == 16
+    fresh = os.open(link.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    assert select.select([fresh], [], [], 0)[0] == []
+    os.close(fresh)
     link.close()
 
 
@@ -105,6 +133,7 @@ def test_a_host_that_is_busy_for_a_moment_loses_nothing(tmp_path: Path) -> None:
 def test_what_nobody_reads_is_lost(tmp_path: Path) -> None:
     device, link, loop = Talker(), PtyLink(tmp_path / "p"), Attachment()
     loop.add("talker", device, link)
+    host = os.open(link.path, os.O_RDWR | os.O_NOCTTY)
     for step in range(100):
         loop.service(step * 5_000_000)
     device.talks = False
@@ -112,6 +141,7 @@ def test_what_nobody_reads_is_lost(tmp_path: Path) -> None:
         loop.service(step * 5_000_000)
     assert link.counters.sent_bytes + link.counters.dropped_bytes == len(device.sent)
     assert link.counters.dropped_bytes > 50_000
+    os.close(host)
     loop.stop()
 
 
