@@ -44,6 +44,7 @@ from drivers.readings import (
     SourceCounters,
     WheelReading,
 )
+from drivers.trips import Trips
 from drivers.wheel_counts import WheelCounts
 
 _MS = 1_000_000
@@ -225,6 +226,7 @@ class ArduinoBridgeConversation:
         self._asked_ns = now_ns
         self._gone: list[Reading] = []  # of sonars and switches that were not answered; told with the next chunk
         self._counts.restart()
+        self._trips = Trips()
         for index, task in enumerate(self._tasks):
             task.misses = task.refusals = 0
             task.due_ns = now_ns + index  # the order of the first round
@@ -369,8 +371,10 @@ class ArduinoBridgeConversation:
         if numbers is None:
             return None
         task.refusals = 0
-        sent_ns = stamp_ns - size * self._byte_ns  # when the board began to send, but not before it was asked
-        return self._understand(task, numbers, max(sent_ns, self._asked_ns))
+        sent_ns = stamp_ns - size * self._byte_ns  # when the board began to send
+        if task.letter == "p":  # a ping takes as long as its echo, and is not stamped by its answer
+            return self._understand(task, numbers, sent_ns)
+        return self._understand(task, numbers, self._trips.sampled_ns(self._asked_ns, sent_ns))
 
     def _has_form(self, task: _Task, numbers: tuple[int, ...]) -> bool:
         match task.letter:

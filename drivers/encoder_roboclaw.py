@@ -27,6 +27,7 @@ from drivers.checksums import crc16_ccitt
 from drivers.conversation import SetBaudRate, silence_limit
 from drivers.errors import FrameError
 from drivers.readings import ClockFit, Identity, LinkState, Reading, SourceCounters, WheelReading
+from drivers.trips import Trips
 from drivers.wheel_counts import Meeting, WheelCounts
 
 _LONGEST_VERSION = 48
@@ -186,6 +187,7 @@ class RoboClawConversation:
         self._quiet_until_ns = now_ns + _QUIET_NS  # it may have half a packet of somebody before us
         self._counts_due_ns = now_ns
         self._battery_due_ns = now_ns + _BATTERY_PERIOD_NS // 2
+        self._trips = Trips()
         self._meeting = Meeting(longest_gap_ns=max(150 * _MS, 3 * self._period_ns))
         self._counts.restart()
 
@@ -304,8 +306,8 @@ class RoboClawConversation:
         return [bytes(rest[:size])] if end > 0 and len(rest) >= size else []
 
     def _understand(self, question: _Question, data: bytes, stamp_ns: int) -> WheelReading | None:
-        # Sampled when the controller answered: its answer's time on the wire is taken off, but not beyond the question.
-        sampled_ns = max(stamp_ns - (len(data) + _CRC_SIZE) * self._byte_ns, question.asked_ns)
+        # Sampled when the controller answered: its answer's time on the wire is taken off.
+        sampled_ns = self._trips.sampled_ns(question.asked_ns, stamp_ns - (len(data) + _CRC_SIZE) * self._byte_ns)
         match question.command:
             case Command.VERSION:
                 self._take_version(data)

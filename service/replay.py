@@ -235,8 +235,8 @@ class Report:
     """What a replay found.
 
     exact: fusion was called exactly as it was live.  digest: of the map.  same_map: whether it is the map that was
-    made live, None if the recording does not say.  sent_otherwise: requests that today's drivers would not have sent
-    like that.  errors: exceptions in drivers and fusion.
+    made live, None if the recording does not say or has no reading.  sent_otherwise: requests that today's drivers
+    would not have sent like that.  errors: exceptions in drivers and fusion.
     """
 
     exact: bool = True
@@ -345,6 +345,8 @@ class Replay:
         live = (self.recording.end or {}).get("map_sha256")
         if live is not None and self.head.start.complete:
             report.same_map = live == report.digest
+            if report.same_map and not report.readings:
+                report.same_map = None  # nothing was played: nothing is proved
         report.why_not.extend(self.recording.cut)
         report.exact = report.exact and not report.why_not
         return report

@@ -17,9 +17,10 @@ encoder); an error disarms. Commands longer than needed are taken; of shorter on
 in use send the axis state as one byte). A board whose node id another one is given has none (3F): it answers who asks
 for addresses and says nothing else. An id that was not saved is forgotten in a reboot.
 
-Assumed: torque mode moves nothing; a target position is reached at the velocity limit; closed loop is entered without a
-calibration before, as a board with stored calibration does; 0.6.x sends what `cyclic_ms` names besides. Which value of
-the tree has which number depends on the firmware: each number reads 0 until it is written, and then what was written.
+Assumed: until a host sets a mode, the board has the one that fits what it is told; torque mode moves nothing; a target
+position is reached at the velocity limit; closed loop is entered without a calibration before, as a board with stored
+calibration does; 0.6.x sends what `cyclic_ms` names besides. Which value of the tree has which number depends on the
+firmware: each number reads 0 until it is written, and then what was written.
 """
 
 from __future__ import annotations
@@ -152,7 +153,7 @@ class ODriveAxis:
         self.disarm_reason = 0
         self.procedure_result = SUCCESS
         self.trajectory_done = True
-        self._mode = VELOCITY_CONTROL
+        self._mode: int | None = None
         self._velocity_limit = 20.0
         self._awake_ns = now_ns
         self._done_ns: int | None = None  # of a calibration
@@ -336,9 +337,9 @@ class ODriveAxis:
     def _move(self, command: int, target: float, now_ns: int) -> None:
         if not abs(target) < 1e9:  # not a number, or none a motor could follow
             return
-        if command == VEL and self._mode == VELOCITY_CONTROL:
+        if command == VEL and self._mode in (None, VELOCITY_CONTROL):
             self._turn(now_ns, max(-self._velocity_limit, min(self._velocity_limit, target)))
-        elif command == POS and self._mode == POSITION_CONTROL and self._velocity_limit > 0.0:
+        elif command == POS and self._mode in (None, POSITION_CONTROL) and self._velocity_limit > 0.0:
             ahead = target - self.turns(now_ns)
             self._turn(now_ns, self._velocity_limit if ahead > 0 else -self._velocity_limit)
             self._arrival_ns = now_ns + round(abs(ahead) / self._velocity_limit * SECOND_NS)

@@ -164,6 +164,9 @@ def _tell(report: Mapping[str, Any]) -> None:
     )
     typer.echo(f"map sha256 {report['map_sha256'] or '(there is no map)'}")
     same = report["same_map_as_live"]
+    if not report["readings"]:
+        text = "nothing to play: the recording holds no reading of any device (`umfeld check` opens each and tells why)"
+        typer.secho(text, fg="yellow")
     if same is not None:
         text = "bit for bit the map that was made live" if same else "NOT the map that was made live"
         typer.secho(text, fg="green" if same else "red")

@@ -382,3 +382,26 @@ def test_the_sources_of_one_board_each_show_their_own() -> None:
     assert shares["front"].counters.readings == len(found["front"])
     with pytest.raises(ValueError, match="two sources"):
         share_out(full(), {"a": WheelReading, "b": WheelReading})
+
+
+def test_an_answer_that_lay_waiting_for_us_was_sampled_as_soon_as_any() -> None:
+    """This program was held up for 100 ms behind a question: what it read then is no later than usual."""
+    conversation, board = ArduinoBridgeConversation(), Board()
+    conversation.connected(0)
+    run(conversation, board)
+    ms = 1000
+    while encode_question("e") not in conversation.requests(ms * MS):
+        ms += 1
+    (reading,) = conversation.receive(b"5 5\r\n", (ms + 100) * MS)
+    assert ms * MS <= reading.stamp_ns <= (ms + 1) * MS
+
+
+def test_a_ping_that_lay_waiting_for_us_keeps_the_time_of_its_question() -> None:
+    conversation, board = ArduinoBridgeConversation(wheels=False, pings=(7,)), Board()
+    conversation.connected(0)
+    run(conversation, board)
+    ms = 1000
+    while encode_question("p", 7) not in conversation.requests(ms * MS):
+        ms += 1
+    (reading,) = conversation.receive(b"107\r\n", (ms + 100) * MS)
+    assert ms * MS <= reading.stamp_ns <= (ms + 1) * MS

@@ -251,3 +251,17 @@ def test_mutated_answers_never_move_the_wheels() -> None:
     assert conversation.counters.drops["bad_answer"] > 150
     again = run(conversation, controller, from_ms=20_200, for_ms=200)
     assert again, "and it is read again at once"
+
+
+def test_an_answer_that_lay_waiting_for_us_was_sampled_as_soon_as_any() -> None:
+    """This program was held up for 50 ms behind a question: what it read then is no later than usual."""
+    conversation, controller = RoboClawConversation(rate_hz=50.0), Controller()
+    conversation.connected(0)
+    run(conversation, controller)
+    ms, asked = 1000, False
+    while not asked:
+        asked = encode_question(ADDRESS, Command.BOTH_COUNTS) in conversation.requests(ms * MS)
+        ms += 1
+    answer = controller.answer(encode_question(ADDRESS, Command.BOTH_COUNTS))
+    (reading,) = conversation.receive(answer, (ms + 49) * MS)
+    assert (ms - 1) * MS <= reading.stamp_ns <= ms * MS

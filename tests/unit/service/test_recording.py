@@ -308,3 +308,26 @@ def test_news_before_a_device_is_set_up_anew_do_not_stand_for_its_readings(tmp_p
     report = Replay(Recording.of(path)).run()
     assert report.why_not == ["it began while the daemon was running: its first poses are not in it"]
     assert report.exact is False
+
+
+def test_a_recording_of_nothing_proves_nothing(tmp_path: Path) -> None:
+    """No device said anything: the map is the one it began with, which is no proof that a replay makes the same."""
+    from typer.testing import CliRunner
+
+    from service.commands.replay import app
+
+    desk = Desk(tmp_path)
+    path = desk.begin(complete=True)
+    desk.clock.turn(SECOND)
+    desk.recorder.end({"map_sha256": Replay(Recording.of(path)).run().digest})
+    report = Replay(Recording.of(path)).run()
+    assert report.readings == 0
+    assert report.same_map is None
+    told = CliRunner().invoke(app, [str(path)])
+    assert told.exit_code == 0
+    assert "no reading of any device" in told.output
+    assert "bit for bit" not in told.output
+    desk = Desk(tmp_path / "other")
+    path = desk.begin(complete=True)
+    desk.recorder.end({"map_sha256": "another"})
+    assert Replay(Recording.of(path)).run().same_map is False

@@ -400,6 +400,21 @@ def test_odrive_turns_in_closed_loop_only_and_stops_with_idle() -> None:
     assert scene.speed["left"] == 0.0
 
 
+@pytest.mark.parametrize("generation", ["0.5", "0.6"])
+def test_odrive_obeys_positions_and_velocities_until_a_mode_is_set(generation: str) -> None:
+    """Programs that set none rely on the saved one, which their users chose for what they command."""
+    one, _ = axis(generation)
+    one.step(SECOND, [Frame(0x007, bytes((8, 0, 0, 0)))])
+    one.step(SECOND, [Frame(0x00C, struct.pack("<fhh", 2.0, 0, 0))])
+    for ms in range(1001, 2000):
+        one.step(ms * SECOND // 1000, [])
+    assert one.turns(2 * SECOND) == pytest.approx(2.0, abs=0.02)
+    one.step(2 * SECOND, [Frame(0x00D, struct.pack("<ff", 1.0, 0.0))])
+    assert one.turns(3 * SECOND) == pytest.approx(3.0, abs=0.02)
+    one.step(3 * SECOND, [Frame(0x00B, struct.pack("<II", 2, 1)), Frame(0x00C, struct.pack("<fhh", 9.0, 0, 0))])
+    assert one.turns(4 * SECOND) == pytest.approx(4.0, abs=0.02), "a position is nothing to a velocity controller"
+
+
 def test_odrive_calibration_takes_seconds() -> None:
     one, _ = axis()
     one.step(SECOND, [Frame(0x007, struct.pack("<I", 3))])
