@@ -226,6 +226,14 @@ class HokuyoConversation:
                 self._advance(None, now_ns)
         return out
 
+    def next_request_ns(self) -> int:
+        """When requests() has something to say next, if nothing arrives before."""
+        return self._deadline_ns if self._step_sent else 0
+
+    def is_amid(self) -> bool:
+        """Whether a part of a scan came, whose rest is on its way."""
+        return self._stream is not None and self._step_sent and self._replies.is_amid
+
     def farewell(self) -> Sequence[bytes | SetBaudRate]:
         """Stops the stream and the laser, in any mode."""
         return [b"QT\n"]

@@ -36,21 +36,32 @@ class BoundedQueue(Generic[ItemT]):
         self._bell = threading.Lock()
         self._bell.acquire()
         self._waiting = False  # somebody waits for the bell, and nobody has rung it
+        self._urgent = False  # among the items is one that does not wait for others
 
-    def put(self, source: str, item: ItemT) -> None:
-        """Add an item; never blocks. May be given to a reader as its sink."""
+    def put(self, source: str, item: ItemT, *, urgent: bool = True) -> None:
+        """Add an item; never blocks. May be given to a reader as its sink.
+
+        urgent: False if nobody need be woken for it: it is taken with the next that is, or when whoever waits for items
+        has waited long enough.
+        """
         with self._lock:
             if len(self._items) >= self._limit:
                 self._drop_one()
             self._items.append((source, item))
             if not self._keep(item):
                 self._droppable[source] = self._droppable.get(source, 0) + 1
+            if not urgent:
+                return
+            self._urgent = True
             ring, self._waiting = self._waiting, False
         if ring:
             self._bell.release()
 
     def get(self, timeout_s: float | None = None) -> tuple[str, ItemT] | None:
-        """The oldest item with its source; None if nothing comes within timeout_s (None: wait for ever)."""
+        """The oldest item with its source; None if nothing comes within timeout_s (None: wait for ever).
+
+        This and get_all wait for an item that is urgent, and take what else there is when the time is up.
+        """
         self._wait(timeout_s)
         with self._lock:
             return self._take_first() if self._items else None
@@ -62,6 +73,7 @@ class BoundedQueue(Generic[ItemT]):
             items = list(self._items)
             self._items.clear()
             self._droppable.clear()
+            self._urgent = False
             return items
 
     def __len__(self) -> int:
@@ -73,9 +85,9 @@ class BoundedQueue(Generic[ItemT]):
             return dict(self._dropped)
 
     def _wait(self, timeout_s: float | None) -> None:
-        """Until there is an item, or for timeout_s."""
+        """Until there is an urgent item, or for timeout_s."""
         with self._lock:
-            if self._items or (timeout_s is not None and timeout_s <= 0.0):
+            if self._urgent or (timeout_s is not None and timeout_s <= 0.0):
                 return
             self._waiting = True
         if self._bell.acquire(timeout=-1 if timeout_s is None else min(timeout_s, threading.TIMEOUT_MAX)):
@@ -89,6 +101,7 @@ class BoundedQueue(Generic[ItemT]):
         source, item = self._items.popleft()
         if not self._keep(item):
             self._droppable[source] -= 1
+        self._urgent = self._urgent and bool(self._items)
         return source, item
 
     def _drop_one(self) -> None:

@@ -31,7 +31,8 @@ log = logging.getLogger(__name__)
 Sink = Callable[[str, Reading | DeviceEvent], None]
 """Where readings and events go: (source, item). Must not block; BoundedQueue.put is one."""
 
-POLL_PERIOD_NS = 20_000_000  # requests() is called at least so often
+POLL_PERIOD_NS = 20_000_000  # requests() is called at least so often, of conversations that do not tell when
+LONGEST_TURN_NS = 60_000_000  # even where all tell: what others post waits no longer
 _FIRST_BACKOFF_NS = 100_000_000
 _LONGEST_BACKOFF_NS = 1_000_000_000
 _SILENCE_PATIENCE_NS = 400_000_000  # a device that only paused keeps its set-up, and wheels their count
@@ -39,7 +40,7 @@ _SHORTEST_BEFORE_RESET_NS = 600_000_000
 _SILENCE_OF_STRANGERS_NS = 200_000_000  # until a source's usual period is known
 _MUCH_LONGER = 1.5  # less is the jitter of its deliveries
 _INTERVALS_KEPT = 9  # three quarters of so many are no longer than a source's usual period
-_CHECK_PERIOD_NS = 10_000_000  # silence and words are looked at so often; a change of state at once
+_CHECK_PERIOD_NS = 50_000_000  # words are looked at so often; a change of state, and silence, at once
 _HELD_UP_NS = 5_000_000  # a turn that took so much longer than it should was held up: by the system, or other threads
 _HOLD_UPS_NS = 60_000_000  # longer than hubs, adapters and schedulers hold readings back: surely silence
 _HOLD_UP_MARGIN = 1.5
@@ -184,7 +185,11 @@ class WireReader(Generic[WireT]):
     # ---- one turn
 
     def step(self) -> None:
-        """One turn: open if closed, else wait for input (20 ms at most), hand it on, send what is due."""
+        """One turn: open if closed, else wait for input (20 ms at most, 60 ms where every conversation runs and tells
+        when it has something to ask), hand it on, send what is due.
+
+        A message of which only the beginning came is waited for, too: a turn for each piece would cost more than it.
+        """
         if self._port is None:
             self._open_when_due()
             return
@@ -196,6 +201,12 @@ class WireReader(Generic[WireT]):
             heard_out_ns = items[-1][1] if items else min(self._clock(), asked_ns + round(wait_s * 1e9))
             with self._lock:
                 self._hand_on(items)
+            while items and self._is_amid() and (left_ns := asked_ns + round(wait_s * 1e9) - self._clock()) > 0:
+                items = port.read(left_ns / 1e9)
+                heard_out_ns = items[-1][1] if items else self._clock()
+                with self._lock:
+                    self._hand_on(items)
+            with self._lock:
                 now_ns = self._clock()
                 if now_ns - heard_out_ns > _HELD_UP_NS:  # what came meanwhile belongs to the questions asked before
                     heard_out_ns = now_ns
@@ -256,10 +267,14 @@ class WireReader(Generic[WireT]):
                 source.opened(now_ns)
 
     def _wait_s(self, now_ns: int) -> float:
-        due_ns = now_ns + POLL_PERIOD_NS
+        due_ns = now_ns + LONGEST_TURN_NS
         for source in self._sources:
-            due_ns = min(due_ns, source.next_request_ns(due_ns), source.silent_from_ns(due_ns))
+            due_ns = min(due_ns, source.next_request_ns(now_ns + POLL_PERIOD_NS), source.silent_from_ns(due_ns))
         return max((due_ns - now_ns) / 1e9, _SHORTEST_WAIT_S)
+
+    def _is_amid(self) -> bool:
+        """Whether the rest of a message is on its way, and no conversation has anything to ask before that."""
+        return all(source.is_amid() for source in self._sources)
 
     def _hand_on(self, items: list[tuple[WireT, int]]) -> None:
         for item, stamp_ns in items:
@@ -342,6 +357,8 @@ class _Source(Generic[WireT]):
         self._log = rated_log
         self._tap = tap
         self._next_request: Callable[[], int | None] | None = getattr(conversation, "next_request_ns", None)
+        self._amid: Callable[[], bool] | None = getattr(conversation, "is_amid", None)
+        self._has_heard = False  # since it was last asked what it has to say
         self._wire_trouble: str | None = "not opened yet"
         self._loop_trouble: str | None = None  # what the loop found wrong: silence, a bug
         self._broken_until_ns: int | None = None  # after a bug: left alone until then
@@ -386,6 +403,7 @@ class _Source(Generic[WireT]):
     def receive(self, item: WireT, stamp_ns: int) -> None:
         if self._broken_until_ns is not None:
             return
+        self._has_heard = True
         try:
             for reading in self._conversation.receive(item, stamp_ns):
                 self._note_reading(stamp_ns)
@@ -394,8 +412,9 @@ class _Source(Generic[WireT]):
             self._note_bug(stamp_ns, error)
 
     def requests(self, now_ns: int) -> Iterable[WireT | SetBaudRate]:
-        if self._broken_until_ns is not None:
+        if self._broken_until_ns is not None or (not self._has_heard and self.next_request_ns(now_ns) > now_ns):
             return ()
+        self._has_heard = False
         try:
             items: Iterable[WireT | SetBaudRate] = self._conversation.requests(now_ns)
         except Exception as error:
@@ -411,15 +430,22 @@ class _Source(Generic[WireT]):
             return ()
         return items
 
-    def next_request_ns(self, latest_ns: int) -> int:
-        """When requests() should be called next; a conversation that keeps a beat says so, others are polled."""
+    def next_request_ns(self, poll_ns: int) -> int:
+        """When requests() should be called next; a conversation that keeps a beat says so, others are polled, and all
+        while they are set up."""
         if self._next_request is None or self._broken_until_ns is not None:
-            return latest_ns
+            return poll_ns
         try:
             due_ns = self._next_request()
         except Exception:
-            return latest_ns  # requests() will meet the same trouble and report it
-        return latest_ns if due_ns is None else due_ns
+            return poll_ns  # requests() will meet the same trouble and report it
+        if due_ns is None:
+            return poll_ns
+        return due_ns if self._seen_state is LinkState.RUNNING else min(due_ns, poll_ns)
+
+    def is_amid(self) -> bool:
+        """Whether a message has begun that is not complete, and nothing is to be asked before it is."""
+        return self._amid is not None and self._broken_until_ns is None and self._amid()
 
     def silent_from_ns(self, latest_ns: int) -> int:
         """When it will be silent if nothing comes; latest_ns if it is, or if it does not run."""

@@ -214,6 +214,11 @@ class ScipReplies:
         self._searched = 0
         self._began_ns = 0
 
+    @property
+    def is_amid(self) -> bool:
+        """Whether a reply has begun that is not complete."""
+        return len(self._buffer) > 0
+
     def clear(self) -> None:
         """Forget a partial reply."""
         self._buffer.clear()

@@ -200,6 +200,7 @@ class Daemon:
             beat=self._notifier.beat,
             health=self._health,
             offered=self._publisher.flush,
+            odometry_is_read=self._publisher.odometry_is_read,
         )
         self._live_map = None
         if maps.building is not None:

@@ -72,7 +72,7 @@ _AHEAD_LIMIT_NS = 100_000_000  # a stamp farther in the future is nonsense; take
 _BEAMS_MAX = 100_000
 _SECTOR_PERIOD_NS = 50_000_000  # a sector map is published so often even if nothing feeds it
 _SECTOR_GAP_NS = 20_000_000  # sonars that follow each other faster are published together, with the next tick
-_POSE_PERIOD_NS = 25_000_000
+POSE_PERIOD_NS = 25_000_000  # a pose is told as soon as its odometry is so much newer than the last one's
 _HELD_MAX = 512  # scans and rounds that are held back for a localiser that is late; beyond, fusion waits for it
 _TOO_FAST_IN_A_ROW = 5  # then the counts are believed, and what lay between them is unknown
 _LOST_SCANS = 3  # in a row that fit nothing, where they alone tell the motion: then it is said
@@ -639,7 +639,7 @@ class Fusion:
         outputs: list[Output] = [
             OdomOut(state.stamp_ns, state.odom_from_base, state.covariance, state.forward_m_s, state.yaw_rad_s)
         ]
-        if self._pose_told_ns is None or state.stamp_ns - self._pose_told_ns >= _POSE_PERIOD_NS:
+        if self._pose_told_ns is None or state.stamp_ns - self._pose_told_ns >= POSE_PERIOD_NS:
             self._pose_told_ns = state.stamp_ns
             outputs.append(self._pose_of(state))
         return outputs

@@ -238,6 +238,14 @@ class Publisher:
             case _:
                 self._outboxes[Lane.STREAM].put(slot, parcel, wake=wake)
 
+    def odometry_is_read(self) -> bool:
+        """Whether anybody gets every motion: a subscriber of `odom` or `tf`, or ROS. True while that is not known yet.
+        Any thread."""
+        if self._ros is not None:
+            return True
+        found = [self._publishers.get(key) for key in (topics.ODOM.pattern, topics.TF_KEY.pattern)]
+        return any(each is None or each[1] is None or each[1].any for each in found)
+
     def publish_info(self, info: RobotInfo) -> None:
         """Send `info` and the fixed transforms; again whenever they change."""
         self._outboxes[Lane.STREAM].put("info", lambda: self._encoder.info(info))

@@ -12,9 +12,9 @@ from functools import partial
 from typing import TypeVar
 
 from drivers.queues import BoundedQueue
-from drivers.readings import DeviceEvent, Reading
+from drivers.readings import DeviceEvent, PoseReading, Reading, WheelReading
 from service.errors import Trouble
-from service.fusion import SECOND, TICK_PERIOD_NS, Fusion
+from service.fusion import POSE_PERIOD_NS, SECOND, TICK_PERIOD_NS, Fusion
 from service.outputs import HealthOut, Output
 
 log = logging.getLogger(__name__)
@@ -62,11 +62,15 @@ class Worker:
         beat: Callable[[int], None],
         health: Callable[[int], HealthOut],
         offered: Callable[[], None] = lambda: None,
+        odometry_is_read: Callable[[], bool] = lambda: True,
     ) -> None:
-        """offered: called when nothing more is offered for a while."""
+        """offered: called when nothing more is offered for a while.  odometry_is_read: whether anybody gets every
+        motion of the wheels; asked from readers' threads."""
         self._fusion = fusion
         self._offer = offer
         self._offered = offered
+        self._odometry_is_read = odometry_is_read
+        self._woken_ns: dict[str, int] = {}  # by source of motion: stamp of the last that this thread was woken for
         self._now_ns = now_ns
         self._beat = beat
         self._health = health
@@ -92,7 +96,21 @@ class Worker:
 
     def sink(self, source: str, item: Reading | DeviceEvent) -> None:
         """For readers; never blocks."""
-        self._queue.put(source, item)
+        self._queue.put(source, item, urgent=not self._can_wait(source, item))
+
+    def _can_wait(self, source: str, item: Reading | DeviceEvent) -> bool:
+        """Whether the fusion thread, which a tick wakes at the latest, need not be woken for this.
+
+        A hundred motions a second are wanted where odometry is read. Elsewhere they are for the poses of the robot,
+        which are told every 25 ms, and of scans, which come by themselves.
+        """
+        if not isinstance(item, WheelReading | PoseReading) or self._odometry_is_read():
+            return False
+        woken_ns = self._woken_ns.get(source)
+        if woken_ns is not None and 0 <= item.stamp_ns - woken_ns < POSE_PERIOD_NS:
+            return True
+        self._woken_ns[source] = item.stamp_ns
+        return False
 
     def ask(self, work: Callable[[], T]) -> T:
         """Run a function between two readings and give its result. Trouble if that does not happen soon."""

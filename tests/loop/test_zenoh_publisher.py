@@ -19,7 +19,7 @@ from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service import cdr
 from service.clock import SystemClock
-from service.outputs import GridOut, GridUpdateOut, HealthOut, Output, PoseOut, ScanOut
+from service.outputs import GridOut, GridUpdateOut, HealthOut, OdomOut, Output, PoseOut, ScanOut
 from service.payloads import RobotInfo
 from service.publisher import Publisher
 from service.rpc import CallRefused
@@ -356,6 +356,26 @@ def test_close_is_quick_and_final(endpoint: str) -> None:
     again = Publisher(BASE, NetworkSettings(listen=(endpoint,)), clock=SystemClock())
     again.start()  # the port is free at once
     assert again.close(GIVE_UP_S)
+
+
+def test_whether_odometry_is_read_is_known(publisher: Publisher, client: Client) -> None:
+    """While it is, every motion wakes fusion; while it is not known yet, too."""
+
+    def odom_out() -> OdomOut:
+        return OdomOut(1, Pose2(), np.eye(3), 0.0, 0.0)
+
+    assert publisher.odometry_is_read()
+    poses = client.subscribe(f"{BASE}/pose")
+    offer_until_it_arrives(publisher, PoseOut(1, Pose2(), Pose2(), np.eye(3)), poses)
+    publisher.offer(odom_out())
+    wait_until(lambda: not publisher.odometry_is_read())
+    odometry = client.subscribe(f"{BASE}/odom")
+    wait_until(publisher.odometry_is_read)
+    odometry.undeclare()
+    wait_until(lambda: not publisher.odometry_is_read())
+    transforms = client.subscribe(f"{BASE}/tf")
+    wait_until(publisher.odometry_is_read)
+    transforms.undeclare()
 
 
 def test_a_bad_value_is_counted_and_silences_nothing(publisher: Publisher, client: Client) -> None:

@@ -474,6 +474,26 @@ def test_silence_is_seen_and_the_device_comes_back() -> None:
     assert "implausible_stamp" not in b.conversation.counters.drops
 
 
+def test_it_tells_when_it_has_something_to_say_and_when_a_scan_has_begun() -> None:
+    b = bench(Peer(utm=True))
+    b.run_until_running()
+    b.run(1 * S)
+    assert b.conversation.next_request_ns() > b.now_ns + 100 * MS, "scans come by themselves"
+    assert not b.conversation.is_amid()
+    scan = b.peer.scan(b.now_ns)
+    assert not list(b.conversation.receive(scan[:-1], b.now_ns))
+    assert b.conversation.is_amid()
+    assert not b.conversation.requests(b.now_ns)
+    list(b.conversation.receive(scan[-1:], b.now_ns))
+    assert not b.conversation.is_amid()
+    due_ns = b.conversation.next_request_ns()
+    b.conversation.requests(due_ns - MS)
+    assert b.conversation.next_request_ns() <= due_ns + 100 * MS
+    b.conversation.connected(b.now_ns)
+    assert b.conversation.next_request_ns() <= b.now_ns
+    assert not b.conversation.is_amid()
+
+
 def test_a_stream_that_stops_is_started_again() -> None:
     b = bench(Peer(utm=True))
     b.run_until_running()

@@ -51,3 +51,28 @@ def test_without_time_to_wait_it_does_not_wait() -> None:
     queue.put("b", 2)
     assert queue.get(0.0) == ("a", 1)
     assert queue.get_all(None) == [("b", 2)]
+
+
+def test_what_can_wait_wakes_nobody_and_comes_in_order_with_what_cannot() -> None:
+    queue: BoundedQueue[int] = BoundedQueue(10)
+    queue.put("a", 1, urgent=False)
+    assert queue.get_all(0.0) == [("a", 1)], "whoever does not wait takes all there is"
+    queue.put("a", 2, urgent=False)
+    got: list[tuple[str, int]] = []
+    waiter = threading.Thread(target=lambda: got.extend(queue.get_all(GIVE_UP_S)))
+    waiter.start()
+    waiter.join(0.05)
+    assert waiter.is_alive(), "it is not woken by what was there"
+    queue.put("a", 3, urgent=False)
+    waiter.join(0.05)
+    assert waiter.is_alive(), "nor by what comes"
+    queue.put("b", 4)
+    waiter.join(GIVE_UP_S)
+    assert got == [("a", 2), ("a", 3), ("b", 4)]
+    queue.put("a", 5, urgent=False)
+    assert queue.get_all(0.001) == [("a", 5)], "the time is up"
+    queue.put("a", 6, urgent=False)
+    queue.put("b", 7)
+    assert [queue.get(GIVE_UP_S), queue.get(GIVE_UP_S)] == [("a", 6), ("b", 7)]
+    queue.put("a", 8, urgent=False)
+    assert queue.get(0.001) == ("a", 8)

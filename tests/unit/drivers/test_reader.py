@@ -7,6 +7,7 @@ import random
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +17,7 @@ from drivers.conversation import SetBaudRate, silence_limit
 from drivers.errors import PortAbsent, PortError
 from drivers.ports import Direction
 from drivers.queues import BoundedQueue
-from drivers.reader import POLL_PERIOD_NS, WireReader
+from drivers.reader import LONGEST_TURN_NS, POLL_PERIOD_NS, WireReader
 from drivers.readings import (
     ChainReading,
     ClockFit,
@@ -94,7 +95,7 @@ class ScriptedPort:
     def read(self, timeout_s: float) -> list[tuple[bytes, int]]:
         if self.lost is not None:
             raise PortAbsent(self.lost)
-        assert 0 <= timeout_s <= 0.02 + 1e-9
+        assert 0 <= timeout_s <= LONGEST_TURN_NS / 1e9 + 1e-9
         end_ns = self.bench.now_ns + round(timeout_s * 1e9)
         while not self.bench.inbox and self.bench.now_ns < end_ns:
             due_ns = self.bench.plan[0][0] if self.bench.plan else end_ns
@@ -222,6 +223,96 @@ def test_a_conversation_with_a_beat_is_asked_on_the_beat() -> None:
     )
     bench.run_until(700)
     assert beating.requested_at == list(range(beat_ns, 700 * MS + 1, beat_ns))
+
+
+class Telling(Talker):
+    """Knows that it has something to say at due_ns only, and whether a message has begun: `!` ends one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.due_ns = 1 << 62
+        self.amid = False
+
+    def receive(self, chunk: bytes, stamp_ns: int) -> Iterator[Reading]:
+        self.amid = not chunk.endswith(b"!")
+        return super().receive(chunk, stamp_ns)
+
+    def next_request_ns(self) -> int:
+        return self.due_ns
+
+    def is_amid(self) -> bool:
+        return self.amid
+
+
+def telling_bench(*plan: tuple[int, bytes], tap: Callable[[Direction, int, object], None] | None = None) -> Bench:
+    """plan: milliseconds and what is then said."""
+    bench = Bench()
+    bench.talkers = {"front": Telling()}
+    bench.reader = WireReader(
+        "bench", bench.open, bench.talkers, bench.sink, clock=lambda: bench.now_ns, wait=bench.wait, tap=tap
+    )
+    bench.plan = [(ms * MS, partial(bench.say, chunk)) for ms, chunk in plan]
+    return bench
+
+
+def test_a_conversation_that_tells_when_is_polled_only_until_it_runs() -> None:
+    bench = telling_bench(*((ms, b"!") for ms in range(200, 1000, 25)))
+    bench.run_until(990)
+    asked = bench.talker.requested_at
+    starting = [at for at in asked if at < 200 * MS]
+    assert max(b - a for a, b in pairwise(starting)) <= POLL_PERIOD_NS
+    assert [at for at in asked if 210 * MS < at < 980 * MS] == [ms * MS for ms in range(225, 980, 25)]
+    assert all(state is not LinkState.SILENT for state in bench.states()[-1:])
+    bench.run_until(1250)
+    assert bench.states()[-1] is LinkState.SILENT
+    told_at = bench.events()[-1][0]
+    assert 975 + 75 <= told_at <= 975 + 300, "silence is noticed when it is due, whoever is polled"
+
+
+def test_a_conversation_is_not_asked_before_it_has_something_to_say() -> None:
+    """A turn that another one needs, with nothing heard: only who is due is asked."""
+    bench = telling_bench(*((ms, b"!") for ms in range(100, 1000, 25)))
+    first = bench.talker
+    other = Talker()
+    bench.reader = WireReader(
+        "bench", bench.open, {"front": first, "other": other}, bench.sink, clock=lambda: bench.now_ns, wait=bench.wait
+    )
+    bench.run_until(900)
+    between = [at for at in other.requested_at if at > 200 * MS and (at // MS) % 25]
+    assert between, "it is polled every 20 ms"
+    assert not set(between) & set(first.requested_at)
+
+
+def test_pieces_of_a_message_cost_one_turn() -> None:
+    turns: list[int] = []
+    heard: list[tuple[int, object]] = []
+
+    def tap(direction: Direction, stamp_ns: int, item: object) -> None:
+        if direction is Direction.TURN:
+            turns.append(stamp_ns)
+        elif direction is Direction.IN:
+            heard.append((stamp_ns, item))
+
+    bench = telling_bench((100, b"!"), (200, b"a"), (201, b"b"), (203, b"c!"), (240, b"!"), tap=tap)
+    bench.run_until(260)
+    assert heard == [(100 * MS, b"!"), (200 * MS, b"a"), (201 * MS, b"b"), (203 * MS, b"c!"), (240 * MS, b"!")]
+    assert [at // MS for at in turns if 190 * MS < at < 250 * MS] == [203, 240]
+    assert [at // MS for at, _, item in bench.items if isinstance(item, ChainReading)] == [100, 203, 240]
+
+
+def test_a_message_that_never_ends_holds_up_no_question() -> None:
+    bench = telling_bench((100, b"!"), *((ms, b"a") for ms in range(150, 400, 3)))
+    bench.run_until(160)
+    bench.talker.requested_at.clear()
+    assert isinstance(bench.talker, Telling)
+    bench.talker.due_ns = 210 * MS
+    bench.run_until(212)
+    assert 210 * MS in bench.talker.requested_at
+    bench.talker.due_ns = 1 << 62
+    bench.talker.requested_at.clear()
+    bench.run_until(390)
+    asked = bench.talker.requested_at
+    assert max(b - a for a, b in pairwise(asked)) <= LONGEST_TURN_NS + MS
 
 
 def test_what_came_while_the_thread_was_held_up_is_heard_before_anything_is_asked() -> None:

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drivers.readings import DeviceEvent, LinkState, ScanReading
+from drivers.readings import DeviceEvent, LinkState, ScanReading, WheelReading
 from mapping.frames import Pose2
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
@@ -89,6 +89,43 @@ def test_health_comes_every_second_and_at_once_when_a_device_changes() -> None:
     office.clock.turn(80_000_000)
     office.worker.turn(0.0)
     assert told_at()[-1] == 4100
+
+
+def test_motions_wake_fusion_where_they_are_read_and_otherwise_as_often_as_poses_are_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    office = Office()
+    is_read = True
+    worker = Worker(
+        office.fusion,
+        office.told.append,
+        now_ns=office.clock.now_ns,
+        beat=office.beats.append,
+        health=lambda now_ns: HealthOut(now_ns, 0, "", (), {}, {}),
+        odometry_is_read=lambda: is_read,
+    )
+    woken: list[int] = []
+
+    def put(_source: str, item: WheelReading, *, urgent: bool) -> None:
+        if urgent:
+            woken.append(item.stamp_ns // 1_000_000)
+
+    monkeypatch.setattr(worker._queue, "put", put)
+    for ms in range(0, 30, 10):
+        worker.sink("drive", WheelReading(ms * 1_000_000, 0, 0, True))
+    assert woken == [0, 10, 20]
+    is_read = False
+    woken.clear()
+    for ms in range(100, 200, 10):
+        worker.sink("drive", WheelReading(ms * 1_000_000, 0, 0, True))
+    assert woken == [100, 130, 160, 190]
+    woken.clear()
+    worker.sink("drive", WheelReading(50_000_000, 0, 0, True))
+    assert woken == [50], "whose clock went back begins anew"
+    woken.clear()
+    worker.sink("front", scan(60_000_000))
+    worker.sink("drive", DeviceEvent(70_000_000, LinkState.ABSENT, "gone"))
+    assert woken == [60, 70], "everything else is taken at once"
 
 
 def test_a_bug_costs_one_reading_not_the_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
