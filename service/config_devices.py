@@ -186,6 +186,13 @@ _NO_ECHO = (
 )
 
 
+def _refuse_unless_below(device: Device, low: str, high: str) -> None:
+    """ValueError where both are given and the lower one is not."""
+    lower, upper = getattr(device, low), getattr(device, high)
+    if lower is not None and upper is not None and lower >= upper:
+        raise ValueError(f"{low} must be below {high}")
+
+
 class HokuyoLaser(Device):
     """Hokuyo laser rangefinder, SCIP 2.x (URG-04LX, UTM-30LX and kin), on USB, RS-232 or TCP (port 10940)."""
 
@@ -208,10 +215,8 @@ class HokuyoLaser(Device):
 
     @model_validator(mode="after")
     def _in_order(self) -> HokuyoLaser:
-        for low, high in (("first_step", "last_step"), ("range_min_m", "range_max_m")):
-            lower, upper = getattr(self, low), getattr(self, high)
-            if lower is not None and upper is not None and lower >= upper:
-                raise ValueError(f"{low} must be below {high}")
+        _refuse_unless_below(self, "first_step", "last_step")
+        _refuse_unless_below(self, "range_min_m", "range_max_m")
         return self
 
 
@@ -258,6 +263,11 @@ class RplidarLaser(Device):
     range_max_m: Positive | None = Field(default=None, description="Farthest echo; default: by model or mode.")
     mount: Mount = Field(default=Mount(), description="Where the laser sits; it looks away from its cable.")
 
+    @model_validator(mode="after")
+    def _in_order(self) -> RplidarLaser:
+        _refuse_unless_below(self, "range_min_m", "range_max_m")
+        return self
+
 
 class LdrobotLaser(Device):
     """LDROBOT LD06 or LD19, on a serial line; it sends as soon as it has power."""
@@ -269,6 +279,11 @@ class LdrobotLaser(Device):
     range_min_m: float = Field(default=0.02, ge=0, description="Nearest echo.")
     range_max_m: Positive = Field(default=12.0, description="Farthest echo.")
     mount: Mount = Field(default=Mount(), description="Where the laser sits; it looks where its mark points.")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> LdrobotLaser:
+        _refuse_unless_below(self, "range_min_m", "range_max_m")
+        return self
 
 
 class SickColaLaser(Device):
@@ -282,6 +297,11 @@ class SickColaLaser(Device):
     range_min_m: float = Field(default=0.05, ge=0, description="Nearest echo.")
     range_max_m: Positive | None = Field(default=None, description="Farthest echo; default: by model.")
     mount: Mount = Field(default=Mount(), description="Where the laser sits.")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> SickColaLaser:
+        _refuse_unless_below(self, "range_min_m", "range_max_m")
+        return self
 
 
 LaserDevice = Annotated[
@@ -320,8 +340,7 @@ class _UsBoard(Device):
                 raise ValueError(f"a USBoard has channels 1 to 16, not {channel}")
             if channels.count(channel) > 1:
                 raise ValueError(f"channel {channel} is given to two transducers; each has a channel of its own")
-        if self.range_min_m >= self.range_max_m:
-            raise ValueError("range_min_m must be below range_max_m")
+        _refuse_unless_below(self, "range_min_m", "range_max_m")
         return self
 
 
@@ -357,8 +376,7 @@ class _PlainSonars(Device):
         channels = [transducer.channel for transducer in self.transducers]
         if len(set(channels)) != len(channels):
             raise ValueError("two transducers have the same channel; each has a channel of its own")
-        if self.range_min_m >= self.range_max_m:
-            raise ValueError("range_min_m must be below range_max_m")
+        _refuse_unless_below(self, "range_min_m", "range_max_m")
         return self
 
 

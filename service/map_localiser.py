@@ -12,6 +12,7 @@ import logging
 import math
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -125,15 +126,16 @@ class KnownMapLocaliser:
         if self._taken_ns is not None and scan.stamp_ns - self._taken_ns < _SCAN_GAP_NS:
             self._counts["localise.scans_passed"] += 1
             return True
-        self._taken_ns = scan.stamp_ns
-        self._take_up(scan.stamp_ns)
+        self._taken_ns = first_ns = scan.stamp_ns  # a search is due by the stamp that is_ready was asked about
+        self._take_up(first_ns)
         swept = deskew(scan, odom_from_base, base_from_sensor)
         scan, odom = swept.scan, swept.odom_from_sensor @ base_from_sensor.inverse()
         nearest = max(_NEAREST_M, scan.range_min_m)
         points = points_of(
             scan.bearing_rad, scan.range_m, base_from_sensor, nearest_m=nearest, farthest_m=FARTHEST_M, most=BEAMS
         )  # fmt: skip
-        self._take_placed(self._localiser.add_scan(scan.stamp_ns, points, odom), odom)
+        placed = self._localiser.add_scan(first_ns, points, odom)
+        self._take_placed(replace(placed, stamp_ns=scan.stamp_ns), odom)
         self._counts["localise.scans"] += 1
         work = self._localiser.take_work()
         if work is not None:

@@ -30,12 +30,20 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Where a sensor sits on the robot: metres and radians in the robot's base frame (x forward, y left)."""
+    """Where a sensor sits on the robot: metres and radians in the robot's base frame (x forward, y left).
+
+    upside_down: head down; what is to its own left is to the robot's right.
+    """
 
     x_m: float = 0.0
     y_m: float = 0.0
     z_m: float = 0.0
     yaw_rad: float = 0.0
+    upside_down: bool = False
+
+    def turned(self, bearing_rad: F64) -> F64:
+        """Bearings of its own, counter-clockwise for whoever stands as it does, as headings in the base frame."""
+        return self.yaw_rad + (-bearing_rad if self.upside_down else bearing_rad)
 
 
 class ByteDevice(Protocol):

@@ -113,7 +113,7 @@ class LogScene:
 
     def beam_ranges(self, mount: Mount, bearing_rad: F64, stamp_ns: F64, range_max_m: float) -> F64:
         """See `device.Scene`; the log's readings for the beams that it has, NaN for others and while under way."""
-        bearing = np.asarray(bearing_rad, dtype=np.float64) + (mount.yaw_rad - self.log.robot_from_laser[2])
+        bearing = mount.turned(np.asarray(bearing_rad, dtype=np.float64)) - self.log.robot_from_laser[2]
         scan = self.scan_at(np.broadcast_to(np.asarray(stamp_ns, dtype=np.float64), bearing.shape))
         if scan is None or not len(bearing):
             return np.full(len(bearing), np.nan)

@@ -81,10 +81,10 @@ class TiltedScene:
         across = np.sin(bearing_rad)
         own = np.stack((np.cos(bearing_rad), across * np.cos(self.roll_rad), across * np.sin(self.roll_rad)), axis=-1)
         angle = self.swing.angle_at(stamp_ns)
-        yaw = np.full(count, mount.yaw_rad)
-        direction = turned(turned(own, self.axle, angle), "yaw", yaw)
+        yaw, over = np.full(count, mount.yaw_rad), np.array([1.0, -1.0, -1.0] if mount.upside_down else [1.0, 1.0, 1.0])
+        direction = turned(over * turned(own, self.axle, angle), "yaw", yaw)
         arm = np.broadcast_to(np.asarray(self.arm_m, dtype=np.float64), (count, 3))
-        origin = turned(turned(arm, self.axle, angle), "yaw", yaw) + (mount.x_m, mount.y_m, mount.z_m)
+        origin = turned(over * turned(arm, self.axle, angle), "yaw", yaw) + (mount.x_m, mount.y_m, mount.z_m)
         return origin, direction
 
     def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:

@@ -526,6 +526,7 @@ def _mount(table: Mapping[str, Any]) -> Mount:
         float(table.get("y_m", 0.0)),
         float(table.get("z_m", 0.0)),
         math.radians(float(table.get("yaw_deg", 0.0))),
+        bool(table.get("upside_down", False)),
     )
 
 

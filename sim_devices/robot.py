@@ -386,7 +386,7 @@ class SimScene:
         stamps = np.broadcast_to(np.asarray(stamp_ns, dtype=np.float64), np.shape(bearing_rad))
         pose = self.pose_at(stamps)
         origin = _mounted(pose, mount)
-        heading = pose[:, 2] + mount.yaw_rad + np.asarray(bearing_rad, dtype=np.float64)
+        heading = pose[:, 2] + mount.turned(np.asarray(bearing_rad, dtype=np.float64))
         world_s = (stamps - self.origin_ns) * (1e-9 * self.speed)
         return self.world.beam_distances(origin, heading, world_s, z_m=mount.z_m, range_max_m=range_max_m)
 

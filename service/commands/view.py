@@ -92,25 +92,25 @@ def _receive(client: Client, base: str, relay: Relay) -> Callable[[], None]:
     samples = [client.subscribe_latched(f"{base}/{keys}", ring=_RING) for keys in DRAWN]
     tokens = subscribe_liveliness(client.session, f"{base}/{ALIVE}")
 
-    def take(subscriber: Any) -> Sequence[Sample] | None:
+    def take(channel: Any) -> Sequence[Sample] | None:
         try:
-            first = subscriber.recv()
-        except zenoh.ZError:
+            batch = [_plain(channel.recv())]
+            while len(batch) < _DRAIN and (more := channel.try_recv()) is not None:
+                batch.append(_plain(more))
+        except zenoh.ZError:  # undeclared
             return None
-        batch = [_plain(first)]
-        while len(batch) < _DRAIN and (more := subscriber.try_recv()) is not None:
-            batch.append(_plain(more))
         return batch
 
     def watch() -> Sequence[Sample] | None:
         try:
-            token = tokens.recv()
+            token = tokens.handler.recv()
         except zenoh.ZError:
             return None
         relay.robot_from_thread(str(token.key_expr).removesuffix(f"/{ALIVE}"), str(token.kind) == "SampleKind.PUT")
         return ()
 
-    pumps = [*(Pump(partial(take, each), relay) for each in samples), Pump(watch, relay)]
+    # By their handlers: a subscriber that waits in recv() itself cannot be undeclared ("Already borrowed").
+    pumps = [*(Pump(partial(take, each.handler), relay) for each in samples), Pump(watch, relay)]
     for pump in pumps:
         pump.start()
 

@@ -128,3 +128,11 @@ def test_what_a_laser_says_of_nothing_may_be_doubted(tmp_path: Path, driver: str
         front = sensors(load_text(tmp_path, text))["front"]
         assert isinstance(front, Laser)
         assert front.nothing_is_free is free
+
+
+@pytest.mark.parametrize("driver", ["hokuyo", "rplidar", "ldrobot", "sick_cola"])
+def test_limits_that_nothing_lies_between_are_refused(tmp_path: Path, driver: str) -> None:
+    port = "tcp://192.168.0.1:2112" if driver == "sick_cola" else "/dev/ttyUSB0"
+    with pytest.raises(WrongUsage) as error:
+        laser(tmp_path, f'driver = "{driver}"\nport = "{port}"\nrange_min_m = 5.0\nrange_max_m = 3.0')
+    assert "lasers.front: range_min_m must be below range_max_m" in str(error.value)

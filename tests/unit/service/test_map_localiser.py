@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -116,6 +117,22 @@ def test_until_it_is_sure_the_pose_may_be_anywhere(localiser: KnownMapLocaliser)
     last = way()[0].inverse() @ way()[-1]
     sure = localiser.locate(OdometryState(20 * PERIOD_NS, last, np.zeros((3, 3)), 0.0, 0.0, False))
     assert sure.covariance[0, 0] < 0.1**2
+
+
+@pytest.mark.parametrize("period_ns", [100_000_000, 110_000_000, 125_000_000, 143_000_000])
+def test_sweeps_that_take_time_are_all_taken(localiser: KnownMapLocaliser, period_ns: int) -> None:
+    # a search's result is asked for by the first beam's stamp, and the sweep is placed at its middle: both are one scan
+    standing, buffer = way()[0], PoseBuffer()
+    for stamp_ns in range(0, 62 * period_ns, period_ns):
+        buffer.add(stamp_ns, Pose2())
+    for stamp_ns in range(period_ns, 60 * period_ns, period_ns):
+        scan = replace(sweep(standing, stamp_ns), beam_period_ns=period_ns / (len(BEARINGS) + 1))
+        assert localiser.is_ready(stamp_ns)
+        localiser.take_scan("lasers", scan, buffer, Pose2())
+        told = [out for out in localiser.outputs(stamp_ns) if isinstance(out, DocumentOut)]
+        assert all(out.stamp_ns > stamp_ns for out in told)  # the middle, where the pose is
+    assert localiser.counters()["localise.scans"] == 59
+    assert localiser.counters()["localise.searches"] > 0
 
 
 def test_where_am_i_is_answered_with_candidates(localiser: KnownMapLocaliser) -> None:
