@@ -61,7 +61,8 @@ SIMPLE_VARIABLES = frozenset(
     (
         "ActiveFieldSet", "EIHstCola", "EIIpAddr", "FieldSetSelectionMethod", "GlareDetectionSens",
         "FREchoFilter", "LFPmeanfilter", "LFPmedianfilter", "LFPparticle", "LICencres",
-        "LICencset", "LICsrc", "SetActiveApplications", "TSCRole", "TSCTCInterface", "TSCTCSrvAddr", "TSCTCupdatetime",
+        "LICencset", "LICsrc", "LocationName", "SetActiveApplications",
+        "TSCRole", "TSCTCInterface", "TSCTCSrvAddr", "TSCTCupdatetime",
     )
 )  # fmt: skip
 
@@ -387,6 +388,7 @@ class SickColaLaser:
             "0": [("s", told.name), ("s", told.firmware)],
             "DeviceIdent": [("s", told.name), ("s", told.firmware)],
             "DItype": [("s", told.name)],
+            "DIornr": [("s", told.order_number)],
             "OrdNum": [("s", told.order_number)],
             "SerialNumber": [("s", f"{self._serial:08d}")],
             "FirmwareVersion": [("s", told.firmware)],

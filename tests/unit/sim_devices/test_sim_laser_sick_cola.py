@@ -270,6 +270,10 @@ def test_plain_variables_are_kept() -> None:
     assert bench.ask(b"sWN FREchoFilter \x02") == b"sWA FREchoFilter "
     assert bench.ask(b"sRN FREchoFilter") == b"sRA FREchoFilter \x02"
     assert bench.say("sWN LFPmeanfilter 0 2 0") == "sWA LFPmeanfilter"
+    assert bench.say("sRN LocationName") == "sRA LocationName B not defined"
+    assert bench.say("sWN LocationName D OutdoorDevice") == "sWA LocationName"
+    assert bench.say("sRN LocationName") == "sRA LocationName D OutdoorDevice"
+    assert bench.say("sRN DIornr").split()[-1] == bench.say("sRN OrdNum").split()[-1]
 
 
 # -- scans -------------------------------------------------------------------------------------------------------------
