@@ -1,5 +1,5 @@
-"""Other people's drivers on the emulated wheel boards, over ptys: basicmicro, tcr-roboclaw, roboclaw, odrive-can and
-canopen.
+"""Other people's drivers on the emulated wheel boards, over ptys: basicmicro, tcr-roboclaw, roboclaw, odrive-can,
+canopen, canopen-asyncio and dronecan's slcan driver.
 
 And the other way round: our drivers on the axes of odrive-can's mock and on nodes of durand.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import importlib.util
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -31,6 +32,7 @@ from sim_devices.encoder_arduino_bridge import ArduinoBridge, Sonar
 from sim_devices.encoder_cia406 import Cia406Encoder
 from sim_devices.encoder_odrive import ODriveAxis
 from sim_devices.encoder_roboclaw import RoboClaw
+from sim_devices.encoder_vesc import Vesc
 from sim_devices.pty_link import PtyLink
 from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.wheel import Side, Wheel
@@ -271,6 +273,81 @@ def test_canopen_finds_an_encoder_and_sets_up_its_pdos(tmp_path: Path) -> None:
             assert heard[1][-1] > heard[1][0]
         finally:
             network.disconnect()
+
+
+@needs("canopen_asyncio")
+def test_canopen_asyncio_finds_encoders_and_reads_their_objects(tmp_path: Path) -> None:
+    """The same library made for asyncio, with a search, uploads, a download and a heartbeat of its own."""
+    master: Any = importlib.import_module("canopen_asyncio")
+    station = CanBusStation(CanBus())
+    station.add_member("host", PtyLink(tmp_path / "can"))
+    for number in (0x20, 0x21):
+        station.bus.add_node(f"encoder {number}", Cia406Encoder(Bench(), number))
+    loop = Attachment()
+    loop.add_station("can", station)
+
+    async def ask() -> None:
+        bus = can.Bus(interface="slcan", channel=str(tmp_path / "can"), bitrate=1_000_000, sleep_after_open=0)
+        network = master.Network(bus=bus)
+        notifier = can.Notifier(bus, network.listeners, 1.0, loop=asyncio.get_running_loop())
+        try:
+            network.scanner.search()
+            for _ in range(int(GIVE_UP_S / 0.05)):
+                if len(network.scanner.nodes) == 2:
+                    break
+                await asyncio.sleep(0.05)
+            assert sorted(network.scanner.nodes) == [0x20, 0x21]
+            for number in network.scanner.nodes:
+                node = network.add_node(number, master.ObjectDictionary())
+                node.sdo.RESPONSE_TIMEOUT = GIVE_UP_S
+                assert int.from_bytes(await node.sdo.aupload(0x1000, 0), "little") & 0xFFFF == 406
+                assert await node.sdo.aupload(0x1008, 0) == b"UMFELD SIM ENC"
+                with pytest.raises(master.SdoAbortedError):
+                    await node.sdo.aupload(0x9999, 0)
+                await node.sdo.adownload(0x1017, 0, (50).to_bytes(2, "little"))
+                assert await node.nmt.await_for_heartbeat(GIVE_UP_S) == "PRE-OPERATIONAL"
+        finally:
+            notifier.stop()
+            bus.shutdown()
+
+    with loop:
+        asyncio.run(ask())
+
+
+@needs("dronecan")
+def test_dronecans_own_slcan_driver_hears_and_drives_a_vesc(tmp_path: Path) -> None:
+    """It talks to the adapter by itself: flushes, waits for each answer, reads in a process of its own."""
+    driver: Any = importlib.import_module("dronecan.driver.slcan")
+    frame: Any = importlib.import_module("dronecan.driver.common").CANFrame
+    station = CanBusStation(CanBus(bitrate_bps=500_000))
+    station.add_member("host", PtyLink(tmp_path / "can"))
+    wheel = pair(90.0)[0]
+    station.bus.add_node("motor", Vesc(wheel, 1))
+    loop = Attachment()
+    loop.add_station("can", station)
+    with loop:
+        time.sleep(0.5)
+        host = driver.SLCAN(str(tmp_path / "can"), bitrate=500_000)
+        try:
+            heard: dict[int, bytes] = {}
+
+            def next_status(number: int) -> bytes:
+                heard.clear()
+                wait_for("status", lambda: _take(host, heard) and number << 8 | 1 in heard)
+                return heard[number << 8 | 1]
+
+            assert int.from_bytes(next_status(9)[:4], "big", signed=True) == 0
+            host.send_frame(frame(3 << 8 | 1, struct.pack(">i", 3000), True))
+            wait_for("its speed", lambda: abs(int.from_bytes(next_status(9)[:4], "big", signed=True) - 3000) < 100)
+        finally:
+            host.close()
+
+
+def _take(host: Any, heard: dict[int, bytes]) -> bool:
+    got = host.receive(0.2)
+    if got is not None:
+        heard[got.id] = bytes(got.data)
+    return got is not None
 
 
 @needs("durand")
