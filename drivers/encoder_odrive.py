@@ -25,6 +25,7 @@ from typing import Literal
 from drivers.conversation import CanFrame, SetBaudRate, silence_limit
 from drivers.errors import FrameError
 from drivers.readings import ClockFit, Identity, LinkState, Reading, SourceCounters, WheelReading
+from drivers.trips import Trips
 from drivers.wheel_counts import Meeting, WheelCounts
 
 _MS = 1_000_000
@@ -106,6 +107,7 @@ class _Axis:
     node: int
     heard_ns: int = _NEVER_HEARD
     asked: bool = False  # for its position, and not answered yet
+    asked_ns: int | None = None  # for its position or count; None if there was an answer since
     unasked_ns: int = _NEVER_HEARD  # when a position came by itself
     heartbeat: Heartbeat | None = None
     turns: float = 0.0
@@ -206,6 +208,7 @@ class ODrivePairConversation:
         self._axes = tuple(_Axis(node) for node in self._nodes)
         self._running = False
         self._both_since_ns: int | None = None
+        self._trips = Trips()
         self._due_ns = now_ns
         self._read(by_count=self._firmware != "0.6")
 
@@ -224,11 +227,13 @@ class ODrivePairConversation:
         late = now_ns - self._due_ns > period_ns
         self._due_ns = (now_ns if late else self._due_ns) + period_ns
         if self._by_count:
+            for axis in self._axes:
+                axis.asked_ns = now_ns
             return [_ask(axis.node, Command.COUNT) for axis in self._axes]
         limit_ns = max(_SENT_BY_ITSELF_NS, 2 * self._period_ns)
         mute = [axis for axis in self._axes if now_ns - max(axis.unasked_ns, self._listens_since_ns) > limit_ns]
         for axis in mute:
-            axis.asked = True
+            axis.asked, axis.asked_ns = True, now_ns
         return [_ask(axis.node, Command.ESTIMATES) for axis in mute]
 
     def next_request_ns(self) -> int:
@@ -280,13 +285,20 @@ class ODrivePairConversation:
         if command is Command.COUNT:
             count, _ = decode_count(data)
             axis.heard_ns = stamp_ns
-            return self._meet(side, count, stamp_ns) if self._by_count else None
+            return self._meet(side, count, self._sampled_ns(axis, stamp_ns)) if self._by_count else None
         axis.turns, _ = decode_estimates(data)
         axis.heard_ns = stamp_ns
         if not axis.asked:
             axis.unasked_ns = stamp_ns
         axis.asked = False
-        return None if self._by_count else self._meet(side, round(axis.turns * self._counts_per_turn), stamp_ns)
+        if self._by_count:
+            return None
+        return self._meet(side, round(axis.turns * self._counts_per_turn), self._sampled_ns(axis, stamp_ns))
+
+    def _sampled_ns(self, axis: _Axis, stamp_ns: int) -> int:
+        """Of what came at stamp_ns: then, or when answers to our questions usually come."""
+        asked_ns, axis.asked_ns = axis.asked_ns, None
+        return stamp_ns if asked_ns is None else self._trips.sampled_ns(asked_ns, stamp_ns)
 
     def _meet(self, side: int, count: int, stamp_ns: int) -> WheelReading | None:
         met = self._meeting.add(side, count, stamp_ns)

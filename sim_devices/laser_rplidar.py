@@ -347,7 +347,7 @@ class RpLidar:
     def _tell_boot(self) -> None:
         self._booted = True
         major, minor = self.firmware
-        text = f"RP LIDAR System.\r\nFirmware Ver {major}.{minor}, HW Ver {self.profile.hardware}\r\n"
+        text = f"RP LIDAR System.\r\nFirmware Ver {major}.{minor} - rtm, HW Ver {self.profile.hardware}\r\n"
         self._wire.send(f"{text}Model: {self.profile.model:02x}\r\n".encode("ascii"), self._boot_done_ns)
 
     # -- requests -----------------------------------------------------------------------------------------------------

@@ -130,6 +130,21 @@ def test_both_generations_count_the_same_motion(generation: int, cyclic_ms: int)
     assert conversation.counters.drops == {}
 
 
+@pytest.mark.parametrize("generation", [5, 6])
+def test_answers_of_axes_that_lay_waiting_for_us_were_sampled_as_soon_as_any(generation: int) -> None:
+    """This program was held up for 80 ms behind its questions: what it read then is no later than usual."""
+    conversation, axes = ODrivePairConversation(0, 1), Axes(generation, cyclic_ms=0)
+    conversation.connected(0)
+    run_axes(conversation, axes)
+    ms, asked = 1000, [frame for frame in conversation.requests(1000 * MS) if isinstance(frame, CanFrame)]
+    while not asked:
+        ms += 1
+        asked = [frame for frame in conversation.requests(ms * MS) if isinstance(frame, CanFrame)]
+    answers = [answer for question in asked for answer in axes.answer(question)]
+    readings = wheels_in([each for answer in answers for each in conversation.receive(answer, (ms + 80) * MS)])
+    assert [ms * MS <= reading.stamp_ns <= (ms + 1) * MS for reading in readings] == [True]
+
+
 def test_positions_that_come_by_themselves_are_not_asked_for() -> None:
     conversation, axes = ODrivePairConversation(0, 1, firmware="0.6"), Axes(6, cyclic_ms=10)
     conversation.connected(0)
