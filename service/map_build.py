@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import math
-import resource
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -40,7 +39,7 @@ from service.log_lines import line_map_of
 from service.map_export import LINES, lines_layer
 from service.map_import import write_grid_map
 from service.recording_log import read_any_log
-from service.resident import give_back_heap
+from service.resident import give_back_code, give_back_heap, peak_bytes
 
 F64 = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -48,6 +47,7 @@ Progress = Callable[[int, int], None]
 OCCUPIED_FROM_PERCENT = 65  # as map servers read a map: occupied_thresh 0.65
 NEAR_M = 0.10
 BEFORE_END_M = 0.20
+LIGHTER_AT = (4, 40, 160)  # calls of progress: when kernels of the first scans are loaded, of closures, of all
 APART_M, APART_RAD = 0.2, math.radians(10.0)  # of scans that add lines: more of them add little
 
 
@@ -125,14 +125,16 @@ def build(
     if poses is PoseSource.SLAM:
         from service.slam_log import run_slam
 
-        run = run_slam(log, scans, progress=progress)
+        run = run_slam(log, scans, progress=_Lighter(progress))
         robot_poses, slam = run.robot_poses, run.figures
+        del run  # and with it the views of all key scans
+        give_back_heap()
     else:
         robot_poses = poses_from_log(log, scans, poses)
     localised = time.monotonic()
     grid = OccupancyGrid(resolution_m=resolution_m, model="counters" if model == "counters" else "log-odds")
     held = set(range(0, len(scans), hold_out)) if hold_out else set()
-    insert_scans(grid, log, scans, robot_poses, left_out=held, progress=progress)
+    insert_scans(grid, log, scans, robot_poses, left_out=held, progress=_Lighter(progress))
     walls = find_walls(grid, log, scans, robot_poses, left_out=held) if crisp else None
     mapped = time.monotonic()
     line_map = lines_of(log, scans, robot_poses, left_out=held)
@@ -143,6 +145,20 @@ def build(
         {"read": read - started, "localise": localised - read, "map": mapped - localised, "lines": lined - mapped},
         walls, slam,
     )  # fmt: skip
+
+
+class _Lighter:
+    """Hands progress on, and gives back what loading kernels left in memory, some 70 MB, once they are loaded."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress, self._calls = progress, 0
+
+    def __call__(self, done: int, total: int) -> None:
+        self._calls += 1
+        if self._calls in LIGHTER_AT:
+            give_back_code()
+        if self._progress is not None:
+            self._progress(done, total)
 
 
 def poses_from_log(log: Log, scans: Sequence[LogScan], source: PoseSource) -> F64:
@@ -311,7 +327,7 @@ def report_of(built: Built, patch: GridPatch, source: PoseSource) -> dict[str, o
         "lines": len(built.line_map.lines(min_seen=2)),
         "refused_tiles": built.grid.refused_tiles,
         "seconds": {name: round(value, 3) for name, value in built.seconds.items()},
-        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1),
+        "peak_memory_mb": round(peak_bytes() / 2**20, 1),
     }
     if built.walls is not None:
         report["walls"] = {

@@ -107,8 +107,8 @@ class BeamCounts:
         at = np.flatnonzero(self._ends)
         tile, local = self._places[at // TILE_CELLS], at % TILE_CELLS
         hit = tile * TILE + np.stack((local // TILE, local % TILE), axis=-1)
-        near = (hit[:, None, :] + AROUND).reshape(-1, 2)
-        return _cells_of_keys(np.unique(_keys(near)))
+        keys = _keys(hit)
+        return _cells_of_keys(np.unique(np.concatenate([keys + _key_step(offset) for offset in AROUND])))
 
     def _at(self, counts: NDArray[np.uint32], cells: I64) -> F64:
         """Counts (N,) of cells (N, 2), 0 where no tile is."""
@@ -126,6 +126,11 @@ def _keys(cells: I64) -> I64:
     return np.asarray((cells[:, 0] << 32) + cells[:, 1] + (1 << 31))
 
 
+def _key_step(offset: I64) -> int:
+    """What an offset (2,) adds to a cell's key."""
+    return (int(offset[0]) << 32) + int(offset[1])
+
+
 def _cells_of_keys(keys: I64) -> I64:
     return np.stack((keys >> 32, (keys & 0xFFFFFFFF) - (1 << 31)), axis=-1)
 
@@ -133,6 +138,9 @@ def _cells_of_keys(keys: I64) -> I64:
 def _numbers_of(cells: I64, offsets: I64) -> NDArray[np.int32]:
     """(N, K) number of the cell at each offset from each cell, -1 where it is none of them. cells: by rows."""
     keys = _keys(cells)
-    wanted = _keys((cells[:, None, :] + offsets).reshape(-1, 2))
-    found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[found] == wanted, found, -1).reshape(len(cells), len(offsets)).astype(np.int32)
+    numbers = np.empty((len(cells), len(offsets)), dtype=np.int32)
+    for k, offset in enumerate(offsets):  # one at a time: there may be a million cells
+        wanted = keys + _key_step(offset)
+        found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        numbers[:, k] = np.where(keys[found] == wanted, found, -1)
+    return numbers

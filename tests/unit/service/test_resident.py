@@ -64,3 +64,12 @@ def test_only_code_and_constants_of_files_are_looked_at() -> None:
         (0x400000, 0x500000, {"Rss": 512, "Private_Dirty": 0}),
         (0x500000, 0x580000, {"Rss": 200}),
     ]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells its peak apart from that of the program before")
+def test_the_peak_is_this_programs_own() -> None:
+    large = "x = bytearray(400 << 20); import subprocess, sys; "
+    own = "import service.resident as r; print(r.peak_bytes() >> 20)"
+    run = f"subprocess.run([sys.executable, '-c', {own!r}], check=True)"
+    mebibytes = int(subprocess.run([sys.executable, "-c", large + run], capture_output=True, check=True).stdout)
+    assert 5 < mebibytes < 200  # an interpreter, not the 400 of its parent
