@@ -25,7 +25,8 @@ class ClosureSettings:
     place_m: key scans on either side along the way that make up a place.  every_m: a place is searched for so
     often, at most `searches` times in one piece of work.  score, rival: of a search, see Found.
     explained, overlap, mean_cost: of the points, see Agreement and Match; half_*: what still has half a vote.
-    weakest_per_m2: least information in the worst direction.  rough_*: what still has rough_worth of a vote: outdoors
+    weakest_per_m2: least information in the worst direction.  prominence: of a peak that may stand for it where a match
+    is tracked, see mapping.localise.slide.  rough_*: what still has rough_worth of a vote: outdoors
     nothing is a plane and little holds a pose, but nearly all that was seen is seen again.  rough_weight: what one
     needs in the graph with the group it came with.  faint_*: what has faint_worth only, and counts where many agree
     over faint_way_m: half of the points, where surfaces are rough (they fit no better than mean_cost): what is plain
@@ -61,6 +62,7 @@ class ClosureSettings:
     half_overlap: float = 0.88
     half_mean_cost: float = 0.42
     weakest_per_m2: float = 1000.0
+    prominence: float = 0.04
     rough_explained: float = 0.70
     rough_overlap: float = 0.95
     rough_mean_cost: float = 0.60

@@ -7,6 +7,7 @@ All of it is one pure function of a snapshot (`Work.run`), so that a thread may 
    is closed the search is narrow again.
 2. Measurement: where the possible drift is small, the matcher starts from the present estimate ("tracked"); else a
    correlative search finds the place ("searched") and the matcher refines it.
+   A tracked one that walls do not hold along themselves is put where the ends of walls meet (`slide`).
 3. Tests of a single closure: most of the scan's points lie on surfaces the others saw, next to none lies in space
    they saw through; no second place fits nearly as well; the geometry holds the pose in every direction; the
    correction is one that the covariance gathered along the way through the graph can explain.
@@ -56,6 +57,7 @@ from mapping.localise.scan_match import (
     weakest_information,
 )
 from mapping.localise.search import APART_M, APART_RAD, find_view, raster_of
+from mapping.localise.slide import slid
 from mapping.localise.views import View
 
 F64 = NDArray[np.float64]
@@ -217,7 +219,12 @@ class Work:
         shot = self.snapshot
         rows = self._around(place, key, self.settings.place_m, 8)
         here = Pose2(*shot.poses[key].tolist())
-        match = match_view(shot.views.view(key), shot.views, rows, shot.poses[rows], here, reach=TRACKING)
+        view = shot.views.view(key)
+        match = match_view(view, shot.views, rows, shot.poses[rows], here, reach=TRACKING)
+        if match is not None and weakest_information(match.information()) < self.settings.weakest_per_m2:
+            held = slid(view, shot.views, rows, shot.poses[rows], match, prominence=self.settings.prominence)
+            self._events["slid"] += held is not None
+            match = match if held is None else held
         closure = self._judged(key, place, rows, match, here, self.settings.tracked_m, searched=False)
         self._events["tracked"] += closure is not None
         return [] if closure is None else [closure]
