@@ -63,6 +63,12 @@ def detect_devices(ports: Ports = None, *, as_json: AsJson = False) -> None:
     else:
         _print_detected(found)
     if not any(each.driver for each in found):
+        if any(not each.trouble for each in found):
+            typer.echo(
+                "nobody answers: is it powered, do the wires cross (TX to RX), is its protocol one of docs/devices? "
+                "On CAN and on networks none is looked for: configure the device, then `umfeld check`",
+                err=True,
+            )
         raise typer.Exit(1)
 
 

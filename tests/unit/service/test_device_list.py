@@ -31,6 +31,20 @@ def test_tables_that_detect_prints_are_a_configuration(probe: Probe, serial: str
         assert getattr(device, "baud_bps", None) == 115200
 
 
+@pytest.mark.parametrize(("trouble", "is_advised"), [("", True), ("permission denied", False)])
+def test_who_finds_nobody_is_told_what_to_look_for(
+    trouble: str, is_advised: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from typer.testing import CliRunner
+
+    from service.commands import devices
+
+    monkeypatch.setattr(devices, "_detect", lambda _: [Detected("/dev/ttyUSB0", "", trouble=trouble)])
+    told = CliRunner().invoke(devices.app, ["detect"])
+    assert told.exit_code == 1
+    assert ("is it powered" in told.output) is is_advised
+
+
 def test_files_beside_ports_are_not_asked(tmp_path: Path) -> None:
     """A pattern over the folder of emulated devices: their configuration lies beside them."""
     master, slave = pty.openpty()
