@@ -28,7 +28,7 @@ from sim_devices.slcan_hub import CanBus, CanBusStation
 from sim_devices.sonar_maxbotix import MaxBotix
 from sim_devices.sonar_usboard import Transducer, UsBoard, UsBoardSerial
 from sim_devices.wheel import Wheel
-from tests.waiting import GIVE_UP_S, SteadyClock, wait_for
+from tests.waiting import GIVE_UP_S, BeatStation, SteadyClock, wait_for
 
 F64 = NDArray[np.float64]
 
@@ -127,6 +127,7 @@ def test_detect_names_what_is_on_each_port_in_time_and_side_by_side(tmp_path: Pa
     adapter = CanBusStation(CanBus())
     adapter.add_member("host", PtyLink(tmp_path / "slcan"))
     attachment.add_station("slcan", adapter)
+    attachment.add_station("beat", BeatStation(clock))
     devices["slcan"] = adapter
     silent = PtyLink(tmp_path / "silent")
     attachment.start()
