@@ -331,8 +331,8 @@ class SickLms2xxLaser:
         self._tell(0xF4, bytes(self._config), now_ns + REPLY_NS)
 
     def _write_config(self, data: bytes, now_ns: int) -> None:
-        """Older hosts write 32 bytes; what they leave out stays."""
-        possible = self._mode == INSTALLATION and 32 <= len(data) <= CONFIG_SIZE + 1
+        """Older hosts write 32 bytes, or 7, up to the unit (Player's sicklms200); what they leave out stays."""
+        possible = self._mode == INSTALLATION and UNIT < len(data) <= CONFIG_SIZE + 1
         possible = possible and data[MEASURING_MODE] in DISTANCE_BITS and data[UNIT] in (0, 1)
         if possible:
             self._config[: len(data)] = data[:CONFIG_SIZE]

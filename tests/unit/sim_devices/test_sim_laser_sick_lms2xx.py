@@ -226,7 +226,7 @@ def test_configuration_is_written_in_installation_mode_only() -> None:
     assert telegrams(bench.ask(READ_CONFIG))[0][1:-1] == bytes(config)
 
 
-@pytest.mark.parametrize("size", [32, 33, 34])
+@pytest.mark.parametrize("size", [7, 32, 33, 34])
 def test_configuration_of_older_length_keeps_the_rest(size: int) -> None:
     bench = Bench()
     bench.ask(INSTALL)
