@@ -37,6 +37,8 @@ NEARBY = Reach((0.30, 0.22, 0.18, 0.15), (0.08, 0.06, 0.05, 0.04))
 LEAST_FIT = 0.3  # of a view's points must be explained, or it says nothing about where it was taken
 FASTEST_M_S = 20.0
 FASTEST_RAD_S = 4.0
+LEAP_M, LEAP_RAD = 2.0, 1.0  # odometry does not move so far at once; stamps may be a scan or two off
+LEAP_M_S = 10.0
 CLEARLY = 1.1  # times better a match must be to be believed against the prediction
 CLEARLY_PER_DEVIATION = 0.04  # and so much more for each deviation beyond the gate
 MOST_BEYOND = 20.0
@@ -120,13 +122,16 @@ class Tracker:
         return view
 
     def predicted(self, stamp_ns: int, base_from_sensor: Pose2, odom_from_base: Pose2 | None) -> Place:
-        """Where the sensor should be: by odometry since the last scan, else by the motion so far."""
+        """Where the sensor should be: by odometry since the last scan, else, or if that leapt, by the motion so far."""
         if self.last is None:
             start = self.start or odom_from_base or IDENTITY
             return Place(start @ base_from_sensor, start, 1.0, 1.0)
         last_ns, last_pose, last_odom = self.last
-        if odom_from_base is not None and last_odom is not None:
-            step = last_odom.inverse() @ odom_from_base
+        step = None if odom_from_base is None or last_odom is None else last_odom.inverse() @ odom_from_base
+        if step is not None and _leaps(step, (stamp_ns - last_ns) * 1e-9):
+            self.events["odometry_leapt"] += 1
+            step = None
+        if step is not None:
             sigma_m, sigma_rad = self.odometry_sigma(math.hypot(step.x_m, step.y_m), abs(step.yaw_rad))
             return Place(last_pose @ step @ base_from_sensor, last_pose @ step, sigma_m, sigma_rad, step)
         seconds = min(max((stamp_ns - last_ns) * 1e-9, 0.0), 0.5)
@@ -282,6 +287,12 @@ class Tracker:
             stamp, pose, odom = self.last
             self.last = (stamp, correction @ pose, odom)
         self._recent = deque(((t, correction @ p) for t, p in self._recent), maxlen=self._recent.maxlen)
+
+
+def _leaps(step: Pose2, seconds: float) -> bool:
+    """Whether no robot moves so in that time: its odometry began anew, or was set."""
+    way_m, turn_rad = math.hypot(step.x_m, step.y_m), abs(step.yaw_rad)
+    return way_m > LEAP_M + LEAP_M_S * max(seconds, 0.0) or turn_rad > LEAP_RAD + FASTEST_RAD_S * max(seconds, 0.0)
 
 
 def _along(step: Pose2) -> float:

@@ -9,11 +9,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.slam_large import ALIKE, HALLS, Case, drive, false_closures, pair_errors, pairs, recorded, simulated
+from bench.slam_large import (
+    ALIKE,
+    HALLS,
+    Case,
+    Wheels,
+    drive,
+    false_closures,
+    pair_errors,
+    pairs,
+    recorded,
+    simulated,
+)
 from mapping.frames import Pose2
+from mapping.localise.pose_graph import relative_poses
 from mapping.scan import Scan
 
 BLOCK = replace(HALLS, columns_m=(0.0, 62.0), rows_m=(0.0, 44.0), tour=((0, 0), (1, 0), (1, 1), (0, 1), (0, 0), (1, 0)))
+
+THERE_AND_BACK = replace(
+    HALLS, columns_m=(0.0, 36.0), rows_m=(0.0, 24.0), tour=((0, 0), (1, 0), (1, 1), (1, 0), (0, 0))
+)
 
 EMPTY = Scan(0, 0.0, np.zeros(0), np.zeros(0), 0.05, 30.0)
 
@@ -40,6 +56,25 @@ def test_corridors_that_all_look_alike_are_not_taken_for_each_other() -> None:
     off_m, off_deg = pair_errors(case, slam.trajectory()[1], pairs(case))
     assert off_m.max() < 0.3
     assert off_deg.max() < 1.5
+
+
+@pytest.mark.slow
+def test_corridors_driven_back_lie_on_themselves() -> None:
+    """Of doors a robot sees one side of the frame on its way there and the other on its way back."""
+    case = simulated("there and back", THERE_AND_BACK, 3, wheels=Wheels(way_share=0.05))
+    slam = drive(case)
+    truth, poses = case.truth, slam.trajectory()[1]
+    middle = int(np.argmax(truth[:, 1]))
+    there = np.arange(0, middle)
+    back = np.array([k for k in range(middle, len(truth)) if math.cos(truth[k, 2] - truth[0, 2]) < -0.9])
+    nearest = there[np.argmin(np.hypot(*(truth[back, None, :2] - truth[None, there, :2]).transpose(2, 0, 1)), axis=1)]
+    true, found = relative_poses(truth[nearest], truth[back]), relative_poses(poses[nearest], poses[back])
+    off_m = np.hypot(*relative_poses(true, found)[:, :2].T)
+    assert len(off_m) > 100
+    assert off_m.mean() < 0.08
+    assert off_m.max() < 0.2
+    assert slam.events["slid"] > 10
+    assert not false_closures(case, slam)
 
 
 @pytest.mark.data

@@ -54,3 +54,18 @@ def test_what_the_way_explains_is_asked_of_odometry_only() -> None:
             at = Pose2(-2.0 + 0.12 * k, 0.0, 0.0)
             slam.add_scan(room(at, k), Pose2(), at if has_odometry else None)
         assert math.isinf(slam._closing().surprise) is not has_odometry
+
+
+def test_odometry_that_begins_anew_moves_nobody() -> None:
+    """A base that was switched off and on in the midst of a log counts from (0, 0, 0) again, or says what it likes."""
+    for again in (Pose2(0.0, 0.0, 0.0), Pose2(40.0, -7.0, 2.5), Pose2(-1.5, 0.3, -1.8)):
+        slam = Slam(start=Pose2(-2.0, 0.0, 0.3))
+        start = Pose2(5.0, 5.0, 1.0)
+        for k in range(30):
+            at = Pose2(-2.0 + 0.1 * k, 0.0, 0.3 + 0.02 * k)
+            since = Pose2(-2.0, 0.0, 0.3).inverse() @ at
+            odom = start @ since if k < 15 else again @ (Pose2(-0.5, 0.0, 0.6).inverse() @ at)
+            found = slam.add_scan(room(at, k), Pose2(), odom).map_from_base
+            assert math.hypot(found.x_m - at.x_m, found.y_m - at.y_m) < 0.03
+            assert abs(found.yaw_rad - at.yaw_rad) < math.radians(0.7)
+        assert slam.events["odometry_leapt"] == 1
