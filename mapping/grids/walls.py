@@ -58,7 +58,7 @@ class WallRules:
 
 
 class BeamCounts:
-    """Ends and passes of beams in the cells of a grid's tiles; 8 bytes a cell, as long as it lives.
+    """Ends and passes of beams in the cells of a grid's tiles; 4 bytes a cell, as long as it lives.
 
     grid: one that holds the scans already; what lies in no tile of it is not counted.
     """
@@ -71,7 +71,7 @@ class BeamCounts:
         rows, cols = (int(k) + 1 for k in table.max(axis=0)) if len(table) else (0, 0)
         self._index = np.full((rows, cols), -1, dtype=np.int32)
         self._index[table[:, 0], table[:, 1]] = np.arange(len(table))
-        self._ends, self._passes = np.zeros((2, len(table) * TILE_CELLS), dtype=np.uint32)
+        self._ends, self._passes = np.zeros((2, len(table) * TILE_CELLS), dtype=np.uint16)
 
     def add(self, map_from_sensor: Pose2, bearing_rad: F64, range_m: F64, *, range_max_m: float) -> None:
         """One sweep; bearing_rad, range_m: (N,) as in mapping.scan.Scan."""
@@ -110,7 +110,7 @@ class BeamCounts:
         keys = _keys(hit)
         return _cells_of_keys(np.unique(np.concatenate([keys + _key_step(offset) for offset in AROUND])))
 
-    def _at(self, counts: NDArray[np.uint32], cells: I64) -> F64:
+    def _at(self, counts: NDArray[np.uint16], cells: I64) -> F64:
         """Counts (N,) of cells (N, 2), 0 where no tile is."""
         table = (cells >> TILE_BITS) - (self._row0, self._col0)
         inside = np.all((table >= 0) & (table < self._index.shape), axis=1)

@@ -15,6 +15,8 @@ from numba import njit
 
 from mapping.kernels.grids import TILE_BITS, TILE_MASK
 
+FULL = 65535
+
 
 @njit(cache=True, nogil=True)
 def count_beams(
@@ -24,6 +26,7 @@ def count_beams(
     """Count every beam with an end: one end where it ends, one pass in each cell that it crosses before.
 
     ox, oy: the sensor, in cells.  bearing: (N,) in the map.  ends, passes: (cells of all tiles,) counts, added to.
+    Where one of both has reached FULL both are halved: what counts is how many ends there are to a pass.
     Beams without echo, too close or not measured count nowhere, nor does what lies where no tile is.
     """
     for i in range(range_m.size):
@@ -44,6 +47,9 @@ def count_beams(
                 tile = np.int64(index[table_row, table_col])
                 if tile >= 0:
                     at = (tile << (2 * TILE_BITS)) + ((row & TILE_MASK) << TILE_BITS) + (col & TILE_MASK)
+                    if ends[at] == FULL or passes[at] == FULL:
+                        ends[at] >>= 1
+                        passes[at] >>= 1
                     if cols_left + rows_left == 0:
                         ends[at] += 1
                     else:

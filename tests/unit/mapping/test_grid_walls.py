@@ -122,6 +122,18 @@ def test_what_stood_there_for_one_scan_is_neither_wall_nor_free(model: Model) ->
     assert was == OCCUPIED or model == "counters"
 
 
+def test_counts_that_are_full_keep_their_ratio() -> None:
+    """A robot that stands for hours: two of three beams end in a cell, the third passes it."""
+    grid = OccupancyGrid()
+    grid.insert_scan(Pose2(0.01, 0.01), np.zeros(1), np.array([3.0]), range_max_m=MAX_M)
+    counts = BeamCounts(grid)
+    counts.add(Pose2(0.01, 0.01), np.zeros(300_000), np.tile([2.0, 2.0, 3.0], 100_000), range_max_m=MAX_M)
+    cell = np.array([[0, 40]])
+    ended, passed = counts._at(counts._ends, cell)[0], counts._at(counts._passes, cell)[0]
+    assert 16_000 < passed < 65_536
+    assert ended / passed == pytest.approx(2.0, rel=0.01)
+
+
 def test_ends_and_passes_are_counted_where_they_are() -> None:
     grid = OccupancyGrid(resolution_m=0.1)
     grid.insert_cells([(0, 0), (5, -5)], [])
