@@ -29,7 +29,7 @@ from drivers.logs import Log, LogError, LogScan, PoseKind
 from mapping.frames import Pose2, wrap_angle
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
-from mapping.grids.walls import BeamCounts
+from mapping.grids.walls import BeamCounts, EndTiles
 from mapping.lines.line_map import LineMap
 from service.errors import WrongUsage
 from service.export import image_of, save_grid, save_pgm_yaml
@@ -195,11 +195,17 @@ def find_walls(
 ) -> Walls:
     """Let a grid that holds these scans call occupied what explains their ends best, and nothing else."""
     robot_from_laser = Pose2(*log.robot_from_laser)
-    counts = BeamCounts(grid)
-    for index, (scan, pose) in enumerate(zip(scans, robot_poses)):
-        if index not in left_out:
-            map_from_laser = Pose2(*pose) @ robot_from_laser
-            counts.add(map_from_laser, scan.bearing_rad, scan.range_m, range_max_m=log.range_max_m)
+    ends = EndTiles(grid)
+
+    def add_all(to: EndTiles | BeamCounts) -> None:
+        for index, (scan, pose) in enumerate(zip(scans, robot_poses)):
+            if index not in left_out:
+                map_from_laser = Pose2(*pose) @ robot_from_laser
+                to.add(map_from_laser, scan.bearing_rad, scan.range_m, range_max_m=log.range_max_m)
+
+    add_all(ends)
+    counts = BeamCounts(grid, ends.places())
+    add_all(counts)
     cells = counts.walls()
     added, undecided = grid.call_occupied(cells)
     return Walls(len(cells), added, undecided)

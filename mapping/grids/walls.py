@@ -35,6 +35,7 @@ I64 = NDArray[np.int64]
 
 AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)], dtype=np.int64)
 EXPLAINED = np.array([(0, 0), (-1, 0), (0, -1), (0, 1), (1, 0)], dtype=np.int64)
+NEIGHBOURS = 2  # cells from an end whose counts matter: a wall may lie beside it, and is blurred over its neighbours
 HALF_A_BEAM = 0.5  # the cost of a cell that nothing passed
 
 
@@ -57,29 +58,68 @@ class WallRules:
             raise ValueError(f"blur_cells is above 0, at most 0.5, got {self.blur_cells}")
 
 
-class BeamCounts:
-    """Ends and passes of beams in the cells of a grid's tiles; 4 bytes a cell, as long as it lives.
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """Tiles by place: places (T, 2); index (R, C) which of them lies at (row0 + row, col0 + column), -1 none."""
 
-    grid: one that holds the scans already; what lies in no tile of it is not counted.
-    """
+    places: I64
+    row0: int
+    col0: int
+    index: NDArray[np.int32]
+
+    @staticmethod
+    def of(places: I64) -> _Table:
+        """The table of tiles (T, 2), T may be 0."""
+        row0, col0 = (int(k) for k in places.min(axis=0)) if len(places) else (0, 0)
+        at = places - (row0, col0)
+        rows, cols = (int(k) + 1 for k in at.max(axis=0)) if len(at) else (0, 0)
+        index = np.full((rows, cols), -1, dtype=np.int32)
+        index[at[:, 0], at[:, 1]] = np.arange(len(at))
+        return _Table(places, row0, col0, index)
+
+
+class EndTiles:
+    """Which tiles of a grid matter to its walls: those near which beams end. In the open most have none."""
 
     def __init__(self, grid: OccupancyGrid) -> None:
         self.resolution_m = grid.resolution_m
-        self._places = np.array(grid.places(), dtype=np.int64).reshape(-1, 2)
-        self._row0, self._col0 = (int(k) for k in self._places.min(axis=0)) if len(self._places) else (0, 0)
-        table = self._places - (self._row0, self._col0)
-        rows, cols = (int(k) + 1 for k in table.max(axis=0)) if len(table) else (0, 0)
-        self._index = np.full((rows, cols), -1, dtype=np.int32)
-        self._index[table[:, 0], table[:, 1]] = np.arange(len(table))
-        self._ends, self._passes = np.zeros((2, len(table) * TILE_CELLS), dtype=np.uint16)
+        self._table = _Table.of(np.array(grid.places(), dtype=np.int64).reshape(-1, 2))
+        self._marked = np.zeros(len(self._table.places), dtype=np.bool_)
+
+    def add(self, map_from_sensor: Pose2, bearing_rad: F64, range_m: F64, *, range_max_m: float) -> None:
+        """One sweep, as BeamCounts.add."""
+        per_m, table = 1.0 / self.resolution_m, self._table
+        bearing = np.asarray(bearing_rad, dtype=np.float64) + map_from_sensor.yaw_rad
+        kernels.mark_ends(
+            map_from_sensor.x_m * per_m, map_from_sensor.y_m * per_m, bearing, np.array(range_m, dtype=np.float64),
+            per_m, float(range_max_m), table.row0, table.col0, table.index, NEIGHBOURS, self._marked,
+        )  # fmt: skip
+
+    def places(self) -> I64:
+        """(T, 2) of those tiles."""
+        return self._table.places[self._marked]
+
+
+class BeamCounts:
+    """Ends and passes of beams in the cells of a grid's tiles; 4 bytes a cell, as long as it lives.
+
+    grid: one that holds the scans already; what lies in no tile of it is not counted.  places: (T, 2) of its tiles, if
+    not all are to be counted in; those of `EndTiles` are enough.
+    """
+
+    def __init__(self, grid: OccupancyGrid, places: I64 | None = None) -> None:
+        self.resolution_m = grid.resolution_m
+        chosen = np.array(grid.places(), dtype=np.int64).reshape(-1, 2) if places is None else places
+        self._table = _Table.of(chosen)
+        self._ends, self._passes = np.zeros((2, len(chosen) * TILE_CELLS), dtype=np.uint16)
 
     def add(self, map_from_sensor: Pose2, bearing_rad: F64, range_m: F64, *, range_max_m: float) -> None:
         """One sweep; bearing_rad, range_m: (N,) as in mapping.scan.Scan."""
-        per_m = 1.0 / self.resolution_m
+        per_m, table = 1.0 / self.resolution_m, self._table
         bearing = np.asarray(bearing_rad, dtype=np.float64) + map_from_sensor.yaw_rad
         kernels.count_beams(
             map_from_sensor.x_m * per_m, map_from_sensor.y_m * per_m, bearing, np.array(range_m, dtype=np.float64),
-            per_m, float(range_max_m), self._row0, self._col0, self._index, self._ends, self._passes,
+            per_m, float(range_max_m), table.row0, table.col0, table.index, self._ends, self._passes,
         )  # fmt: skip
 
     def walls(self, rules: WallRules | None = None) -> I64:
@@ -105,20 +145,21 @@ class BeamCounts:
     def _cells_near_ends(self) -> I64:
         """(N, 2) cells in or beside which beams end, by rows and columns."""
         at = np.flatnonzero(self._ends)
-        tile, local = self._places[at // TILE_CELLS], at % TILE_CELLS
+        tile, local = self._table.places[at // TILE_CELLS], at % TILE_CELLS
         hit = tile * TILE + np.stack((local // TILE, local % TILE), axis=-1)
         keys = _keys(hit)
         return _cells_of_keys(np.unique(np.concatenate([keys + _key_step(offset) for offset in AROUND])))
 
     def _at(self, counts: NDArray[np.uint16], cells: I64) -> F64:
         """Counts (N,) of cells (N, 2), 0 where no tile is."""
-        table = (cells >> TILE_BITS) - (self._row0, self._col0)
-        inside = np.all((table >= 0) & (table < self._index.shape), axis=1)
+        index = self._table.index
+        at = (cells >> TILE_BITS) - (self._table.row0, self._table.col0)
+        inside = np.all((at >= 0) & (at < index.shape), axis=1)
         tile = np.full(len(cells), -1, dtype=np.int64)
-        tile[inside] = self._index[table[inside, 0], table[inside, 1]]
+        tile[inside] = index[at[inside, 0], at[inside, 1]]
         local = cells & TILE_MASK
-        at = tile * TILE_CELLS + local[:, 0] * TILE + local[:, 1]
-        return np.where(tile >= 0, counts[np.maximum(at, 0)], 0).astype(np.float64)
+        cell = tile * TILE_CELLS + local[:, 0] * TILE + local[:, 1]
+        return np.where(tile >= 0, counts[np.maximum(cell, 0)], 0).astype(np.float64)
 
 
 def _keys(cells: I64) -> I64:

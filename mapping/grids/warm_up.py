@@ -11,7 +11,7 @@ from mapping.grids.beam_model import beams_of_scan
 from mapping.grids.clearance import DistanceField, clearance_layer
 from mapping.grids.evidence import Model
 from mapping.grids.occupancy import OccupancyGrid
-from mapping.grids.walls import BeamCounts
+from mapping.grids.walls import BeamCounts, EndTiles
 from mapping.kernels.beams import drop_own
 from mapping.mixed_pixels import without_mixed_pixels
 from mapping.narrow_gaps import without_narrow_gaps
@@ -49,6 +49,8 @@ def warm_up_walls() -> None:
     grid = OccupancyGrid(max_tiles=16)
     bearing, ranges = np.linspace(-1.0, 1.0, 9), np.ones(9)
     grid.insert_scan(Pose2(), bearing, ranges, range_max_m=2.0)
-    counts = BeamCounts(grid)
+    ends = EndTiles(grid)
+    ends.add(Pose2(), bearing, ranges, range_max_m=2.0)
+    counts = BeamCounts(grid, ends.places())
     counts.add(Pose2(), bearing, ranges, range_max_m=2.0)
     grid.call_occupied(counts.walls())

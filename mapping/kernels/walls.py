@@ -19,6 +19,26 @@ FULL = 65535
 
 
 @njit(cache=True, nogil=True)
+def mark_ends(
+    ox: float, oy: float, bearing: Any, range_m: Any, per_m: float, range_max_m: float, row0: int, col0: int,
+    index: Any, margin: int, marked: Any,
+) -> None:  # fmt: skip
+    """Mark the tiles (T,) that lie within `margin` cells, less than a tile, of where a beam ends; as count_beams."""
+    for i in range(range_m.size):
+        if not 0.0 <= range_m[i] <= range_max_m:
+            continue
+        length = range_m[i] * per_m
+        col, row = math.floor(ox + length * math.cos(bearing[i])), math.floor(oy + length * math.sin(bearing[i]))
+        for near_row in (row - margin, row + margin):
+            for near_col in (col - margin, col + margin):
+                table_row, table_col = (near_row >> TILE_BITS) - row0, (near_col >> TILE_BITS) - col0
+                if 0 <= table_row < index.shape[0] and 0 <= table_col < index.shape[1]:
+                    tile = np.int64(index[table_row, table_col])
+                    if tile >= 0:
+                        marked[tile] = True
+
+
+@njit(cache=True, nogil=True)
 def count_beams(
     ox: float, oy: float, bearing: Any, range_m: Any, per_m: float, range_max_m: float, row0: int, col0: int,
     index: Any, ends: Any, passes: Any,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapping.frames import Pose2
 from mapping.grids.evidence import Model
 from mapping.grids.occupancy import FREE, OCCUPIED, PARTLY_FREE, UNKNOWN, OccupancyGrid
-from mapping.grids.walls import BeamCounts, WallRules
+from mapping.grids.walls import BeamCounts, EndTiles, WallRules
 from mapping.kernels import walls as kernels
 
 F64 = NDArray[np.float64]
@@ -132,6 +132,34 @@ def test_counts_that_are_full_keep_their_ratio() -> None:
     ended, passed = counts._at(counts._ends, cell)[0], counts._at(counts._passes, cell)[0]
     assert 16_000 < passed < 65_536
     assert ended / passed == pytest.approx(2.0, rel=0.01)
+
+
+def test_tiles_without_ends_need_not_be_counted_in() -> None:
+    """A yard: most beams end far off, at the edges of tiles too."""
+    rng = np.random.default_rng(4)
+    scans = []
+    for x in np.linspace(-30.0, 30.0, 40):
+        ranges = rng.choice([5.0, 12.0, 25.0], len(BEARING)) + rng.normal(0.0, 0.1, len(BEARING))
+        scans.append((Pose2(float(x), 0.3, float(rng.uniform(-3.0, 3.0))), np.where(BEARING < 0.2, ranges, 25.6)))
+    grid = grid_of(scans)
+    ends = EndTiles(grid)
+    for pose, ranges in scans:
+        ends.add(pose, BEARING, ranges, range_max_m=MAX_M)
+    few = BeamCounts(grid, ends.places())
+    for pose, ranges in scans:
+        few.add(pose, BEARING, ranges, range_max_m=MAX_M)
+    np.testing.assert_array_equal(few.walls(), counts_of(grid, scans).walls())
+
+
+def test_tiles_within_reach_of_an_end_are_marked_and_no_others() -> None:
+    grid = OccupancyGrid(resolution_m=0.1)
+    grid.insert_cells([(row, col) for row in (-5, 5) for col in (-5, 5, 140)], [])
+    for col, expected in ((3, 1), (1, 2), (126, 2), (64, 1)):
+        ends = EndTiles(grid)
+        ends.add(Pose2(0.05, 6.05), np.zeros(1), np.array([0.1 * col]), range_max_m=MAX_M)
+        found = {tuple(place) for place in ends.places().tolist()}
+        assert (0, 0) in found
+        assert len(found) == expected, (col, found)
 
 
 def test_ends_and_passes_are_counted_where_they_are() -> None:
