@@ -154,8 +154,8 @@ class MaxBotixConversation:
             return None
         if self._bytes_only:
             return (
-                "bytes arrive, but no values: check that the line is not inverted (RS-232 against TTL), 9600 bit/s, "
-                f"and the family ({self._family}: {self._model.digits} digits)"
+                "bytes arrive, but no values: check that the line is not inverted (RS-232 against TTL), "
+                f"its speed (9600 bit/s, USB types 57600) and the family ({self._family}: {self._model.digits} digits)"
             )
         return "nothing heard from the sensor: check its power and its serial wire" if self._overdue else None
 

@@ -385,7 +385,9 @@ class MaxBotixSonars(_PlainSonars):
 
     driver: Literal["maxbotix"] = Field(description="Says that it is this kind of device.")
     port: str = Field(min_length=1, description="Serial port, best by a stable name: /dev/serial/by-id/...")
-    baud_bps: int = Field(default=9600, ge=1200, le=4000000, description="Line speed; a sensor's own is 9600.")
+    baud_bps: int = Field(
+        default=9600, ge=1200, le=4000000, description="Line speed; a sensor's own is 9600, of USB types 57600."
+    )
     family: Literal["lv", "xl", "hr-5m", "hr-10m"] = Field(
         description="What the digits mean: lv inches, xl centimetres, hr millimetres (5 m or 10 m type)."
     )

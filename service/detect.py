@@ -188,7 +188,7 @@ _USUAL_SPEEDS = frozenset((1200, 2400, 4800, 9600, 14400, 19200, 28800, 38400, 5
 
 PROBES = (
     Probe("ldrobot", "lasers", (230400,), (), _ldrobot),
-    Probe("maxbotix", "sonars", (9600,), (), _maxbotix, 0.9),
+    Probe("maxbotix", "sonars", (9600, 57600), (), _maxbotix, 0.9),
     Probe("mavlink", "wheels", (57600, 115200), (), _mavlink, 1.1),
     Probe("hokuyo", "lasers", (115200, 19200, 57600, 38400), (b"VV\nV\n",), _hokuyo),
     Probe("sick_lms2xx", "lasers", (9600, 38400, 19200, 500000), (bytes.fromhex("020001003a1e12"),), _sick, 0.5),

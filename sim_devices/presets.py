@@ -247,13 +247,13 @@ class _Builder:
         if family not in FAMILIES:
             raise PresetError(f"{place}.family: no {family!r}; there are {', '.join(FAMILIES)}")
         lines, half_angle_rad = str(sonar.get("lines", "single")), _half_cone_rad(sonar)
+        baud_bps = int(sonar.get("baud_bps", 9600))
         if lines == "single":
             first = mounts[min(mounts)]
             sonar["rate_hz"] = round(1e9 / FAMILIES[family].period_ns, 2)
-            return MaxBotix(scene, first, family=family, half_angle_rad=half_angle_rad, seed=seed)
+            return MaxBotix(scene, first, family=family, half_angle_rad=half_angle_rad, baud_bps=baud_bps, seed=seed)
         if lines == "list" and sorted(mounts) != list(range(1, len(mounts) + 1)):
             raise PresetError(f"{place}.transducers: a list has channels 1 to {len(mounts)}, each in its place")
-        baud_bps = int(sonar.get("baud_bps", 9600))
         several = TextMultiplexer(
             scene, mounts, family=family, half_angle_rad=half_angle_rad, baud_bps=baud_bps, lines=lines, seed=seed
         )

@@ -1,6 +1,7 @@
 """MaxBotix ultrasonic rangers by their serial text, one sensor on a line; and several behind a text multiplexer.
 
-Source: data sheets of the LV-EZ, XL, HR and HRXL families. 9600 8N1, no address, no check sum, no questions.
+Source: data sheets of the LV-EZ, XL, HR and HRXL families. 9600 8N1 (USB types 57600), no address, no check sum, no
+questions.
 
     LV-EZ   R123 CR     inches   006..254, 255 nothing seen     every 49 ms, the text in the last 5
     XL      R123 CR     cm       020..765, 765 nothing seen     every 99 ms
@@ -51,6 +52,7 @@ class Family:
     period_ns: int
     banner: tuple[str, ...]
     tail: str = ""
+    baud_bps: int = BAUD
 
     def text(self, range_m: float) -> bytes:
         """A reading, without its CR."""
@@ -67,7 +69,7 @@ FAMILIES: dict[str, Family] = {
     "hr": Family(0.001, 4, 300, 4999, 5000, 133_000_000, _HRXL_BANNER),
     "hr-5m": Family(0.001, 4, 300, 4999, 5000, 133_000_000, _HRXL_BANNER),
     "hr-10m": Family(0.001, 4, 500, 9998, 9999, 166_000_000, _HRXL_BANNER),
-    "hrusb": Family(0.001, 4, 300, 4999, 5000, 133_000_000, ("HRUSB-MaxSonar", "RoHS"), tail=" "),
+    "hrusb": Family(0.001, 4, 300, 4999, 5000, 133_000_000, ("HRUSB-MaxSonar", "RoHS"), " ", 57600),
 }
 
 
@@ -196,6 +198,7 @@ class MaxBotix(_Talker):
     """One sensor on its own line. The first step is power-on.
 
     family: "lv", "xl", "hr", "hr-10m" or "hrusb".  half_angle_rad: half its opening angle.  Faults call it channel 1.
+    baud_bps: another than the family's.
     """
 
     def __init__(
@@ -206,10 +209,11 @@ class MaxBotix(_Talker):
         family: str = "hr",
         half_angle_rad: float = radians(15.0),
         noise_m: float = 0.002,
+        baud_bps: int | None = None,
         seed: int = 0,
     ) -> None:
         self.family = FAMILIES[family]
-        super().__init__(self.family.banner, BAUD)
+        super().__init__(self.family.banner, self.family.baud_bps if baud_bps is None else baud_bps)
         self._ear = _Ear(scene, mount, half_angle_rad, self.family, noise_m, seed)
         self._ears = {1: self._ear}
 

@@ -213,7 +213,12 @@ def _as_toml(found: list[Detected]) -> str:
 
 
 _FIRST_NAMES = {"lasers": "front", "sonars": "ring", "wheels": "drive", "can": "main"}
-_USUAL_BPS = {"arduino-bridge": 57600, "roboclaw": 38400, "mavlink": 57600}  # of drivers that do not look for it
+_USUAL_BPS = {
+    "maxbotix": 9600,
+    "arduino-bridge": 57600,
+    "roboclaw": 38400,
+    "mavlink": 57600,
+}  # of drivers that do not look for it
 _FAMILIES = "as printed on the sensor: lv, xl, hr-5m or hr-10m"
 _DRIVE = "measure: wheel_radius_left_m, wheel_radius_right_m, track_width_m, ticks_per_turn_left, ticks_per_turn_right"
 

@@ -120,6 +120,7 @@ def test_detect_names_what_is_on_each_port_in_time_and_side_by_side(tmp_path: Pa
         "roboclaw": RoboClaw(*wheels, link="ttl"),
         "usboard-serial": UsBoardSerial(UsBoard(room, {1: Transducer(Mount())})),
         "maxbotix": MaxBotix(room, Mount()),
+        "maxbotix on USB": MaxBotix(room, Mount(), family="hrusb"),
         "mavlink": MavlinkAutopilot(room),
     }
     for name, device in devices.items():
@@ -141,7 +142,7 @@ def test_detect_names_what_is_on_each_port_in_time_and_side_by_side(tmp_path: Pa
         silent.close()
         clock.stop()
     assert {name: each.driver for name, each in found.items()} == {
-        **{name: name for name in devices},
+        **{name: name.removesuffix(" on USB") for name in devices},
         "silent": "",
         "absent": "",
     }
@@ -150,6 +151,7 @@ def test_detect_names_what_is_on_each_port_in_time_and_side_by_side(tmp_path: Pa
     assert identity is not None
     assert identity.serial == "H0614967"
     assert found["ldrobot"].speed_bps == 230400
+    assert (found["maxbotix"].speed_bps, found["maxbotix on USB"].speed_bps) == (9600, 57600)
     assert took_s < 30.0, "one after the other would take minutes: a silent port alone takes twelve seconds"
 
 

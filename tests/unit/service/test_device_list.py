@@ -27,7 +27,7 @@ def test_tables_that_detect_prints_are_a_configuration(probe: Probe, serial: str
     config = load(path, environment={}).config
     device = next((device for _, _, device in config.devices()), None)
     assert (device is None) == (probe.section == "can")
-    if probe.driver in ("arduino-bridge", "roboclaw", "mavlink"):  # which do not look for the speed
+    if probe.driver in ("maxbotix", "arduino-bridge", "roboclaw", "mavlink"):  # which do not look for the speed
         assert getattr(device, "baud_bps", None) == 115200
 
 
