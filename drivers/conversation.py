@@ -7,9 +7,12 @@ No port, clock, thread, log or sleep: time is handed in. The reader (reader.py) 
     for reading in conversation.receive(chunk, stamp): queue it
     for item in conversation.farewell(): send it      motors and lasers off
 
-Two methods are optional. `next_request_ns()` tells when requests() has something to say next if nothing arrives before:
-such a conversation, once it runs, is asked then and after what it received, and not every 20 ms. `is_amid()` tells that
-a message has begun whose rest is on its way, and that nothing is to be asked before it is there.
+Four methods are optional. `next_request_ns()` tells when requests() has something to say next if nothing arrives
+before: such a conversation, once it runs, is asked then and after what it received, and not every 20 ms. `is_amid()`
+tells that a message has begun whose rest is on its way, and that nothing is to be asked before it is there.
+`hears(item)` tells whether receive() would do anything with it. `prepared()` gives what requests() will say at the time
+of next_request_ns() if nothing arrives before (None: ask then): it may be sent then, and requests() called soon after,
+with that time and before anything that came since is handed on.
 
 `Wire` is `bytes` on serial and TCP lines, `CanFrame` on CAN. Any split of the same bytes gives the same readings.
 A conversation never raises on what comes over the wire: it counts the reason in `counters.drops` and goes on.

@@ -576,6 +576,15 @@ class _Cia406Conversation(ABC):
             return _NEVER
         return self._sync_due_ns if self._round is None else self._round.sync_ns + self._answer_limit_ns()
 
+    def prepared(self) -> CanFrame | None:
+        """The SYNC of next_request_ns(), if one is to be sent then."""
+        is_next = self._produce_sync and not self._cyclic and self._round is None and self._all_started()
+        return _SYNC if is_next else None
+
+    def hears(self, chunk: CanFrame) -> bool:
+        """Whether a frame is of one of the nodes, or SYNC."""
+        return chunk.can_id in self._handlers
+
     def receive(self, chunk: CanFrame, stamp_ns: int) -> Iterator[Reading]:
         handler = self._handlers.get(chunk.can_id)
         if handler is None or chunk.extended or chunk.remote:

@@ -24,6 +24,7 @@ from typing import Generic
 from drivers.conversation import MOST_SILENCE_NS, Conversation, SetBaudRate, WireT
 from drivers.errors import PortError
 from drivers.ports import Clock, Direction, Port, Tap
+from drivers.reader_memory import LONGEST_BACKOFF_NS, Backoff, HoldUps, Rate, RateLimitedLog, UsualPeriod
 from drivers.readings import ClockFit, DeviceEvent, Identity, LinkState, Reading, SourceCounters
 
 log = logging.getLogger(__name__)
@@ -33,22 +34,14 @@ Sink = Callable[[str, Reading | DeviceEvent], None]
 
 POLL_PERIOD_NS = 20_000_000  # requests() is called at least so often, of conversations that do not tell when
 LONGEST_TURN_NS = 60_000_000  # even where all tell: what others post waits no longer
-_FIRST_BACKOFF_NS = 100_000_000
-_LONGEST_BACKOFF_NS = 1_000_000_000
 _SILENCE_PATIENCE_NS = 400_000_000  # a device that only paused keeps its set-up, and wheels their count
 _SHORTEST_BEFORE_RESET_NS = 600_000_000
 _SILENCE_OF_STRANGERS_NS = 200_000_000  # until a source's usual period is known
 _MUCH_LONGER = 1.5  # less is the jitter of its deliveries
-_INTERVALS_KEPT = 9  # three quarters of so many are no longer than a source's usual period
 _CHECK_PERIOD_NS = 50_000_000  # words are looked at so often; a change of state, and silence, at once
 _HELD_UP_NS = 5_000_000  # a turn that took so much longer than it should was held up: by the system, or other threads
-_HOLD_UPS_NS = 60_000_000  # longer than hubs, adapters and schedulers hold readings back: surely silence
-_HOLD_UP_MARGIN = 1.5
-_HOLD_UPS_KEPT_NS = 10_000_000_000  # and for as long again
-_READINGS_TO_KNOW = 50
 _SETUP_LIMIT_NS = 20_000_000_000  # spin-up and the search for a line speed included
 _EVENT_PERIOD_NS = 1_000_000_000  # between two events that tell the same state in other words
-_LOG_PERIOD_NS = 60_000_000_000
 _SHORTEST_WAIT_S = 0.0005
 _POSTED_MAX = 16
 
@@ -123,11 +116,11 @@ class WireReader(Generic[WireT]):
         self._port_trouble: str | None = "not opened yet"
         self._past_drops: dict[str, int] = {}
         self._openings = self._attempts = 0
-        self._backoff = _Backoff()
+        self._backoff = Backoff()
         self._heard_ns = 0
         self._turned_ns = 0  # when the loop last had its turn
         self._thread: threading.Thread | None = None
-        self._log = _RateLimitedLog()
+        self._log = RateLimitedLog()
         self._sources: list[_Source[WireT]] = [
             _Source(source, conversation, sink, self._log, tap) for source, conversation in conversations.items()
         ]
@@ -198,7 +191,15 @@ class WireReader(Generic[WireT]):
             wait_s = self._wait_s(self._clock())
             asked_ns = self._clock()
             items = port.read(wait_s)
+            said: _Said[WireT] | None = None
+            if not items and (said := self._say_prepared(port)) is not None:
+                left_s = self._wait_s(said.sent_ns, but=said.source)
+                wait_s += left_s
+                items = port.read(left_s)
             heard_out_ns = items[-1][1] if items else min(self._clock(), asked_ns + round(wait_s * 1e9))
+            if said is not None:
+                with self._lock:
+                    self._note_said(port, said)
             with self._lock:
                 self._hand_on(items)
             while items and self._is_amid() and (left_ns := asked_ns + round(wait_s * 1e9) - self._clock()) > 0:
@@ -214,10 +215,11 @@ class WireReader(Generic[WireT]):
                     now_ns = max(self._clock(), now_ns)
                 if self._tap is not None:
                     self._tap(Direction.TURN, now_ns, "")
-                for source in self._sources:
+                due = [source for source in self._sources if source.is_due(now_ns)]
+                for source in due:
                     self._send(port, source.requests(now_ns), now_ns)
                 self._send_posted(port)
-                self._hear_out(now_ns, heard_out_ns, round(wait_s * 1e9))
+                self._hear_out(due, now_ns, heard_out_ns, round(wait_s * 1e9))
                 if self._start_anew.is_set():
                     self._start_anew.clear()
                     for source in self._sources:
@@ -247,7 +249,7 @@ class WireReader(Generic[WireT]):
     def _open_when_due(self) -> None:
         wait_ns = self._backoff.due_ns - self._clock()
         if wait_ns > 0:
-            self._wait(min(wait_ns, _LONGEST_BACKOFF_NS) / 1e9)
+            self._wait(min(wait_ns, LONGEST_BACKOFF_NS) / 1e9)
             return
         try:
             port = self._open_port()
@@ -266,11 +268,41 @@ class WireReader(Generic[WireT]):
             for source in self._sources:
                 source.opened(now_ns)
 
-    def _wait_s(self, now_ns: int) -> float:
-        due_ns = now_ns + LONGEST_TURN_NS
+    def _wait_s(self, now_ns: int, *, but: _Source[WireT] | None = None) -> float:
+        """Until a turn is needed; for the source `but`, which has just spoken, only if no answer comes."""
+        due_ns = now_ns + (LONGEST_TURN_NS if but is None else POLL_PERIOD_NS)
         for source in self._sources:
-            due_ns = min(due_ns, source.next_request_ns(now_ns + POLL_PERIOD_NS), source.silent_from_ns(due_ns))
+            if source is not but:
+                due_ns = min(due_ns, source.next_ns)
         return max((due_ns - now_ns) / 1e9, _SHORTEST_WAIT_S)
+
+    def _say_prepared(self, port: Port[WireT]) -> _Said[WireT] | None:
+        """Send what a source prepared for now, if that is all there is to do; the rest follows with the answer.
+
+        After a wait nothing is in the processor's caches: a whole turn for each SYNC costs as much as for its answers.
+        """
+        if self._posted:
+            return None
+        now_ns = self._clock()
+        due = [source for source in self._sources if source.is_due(now_ns)]
+        if len(due) != 1 or (item := due[0].prepared) is None:
+            return None
+        port.write(item)
+        return _Said(due[0], item, now_ns)
+
+    def _note_said(self, port: Port[WireT], said: _Said[WireT]) -> None:
+        """Let the source know that it has spoken; whatever else it had to say then is sent now."""
+        if self._tap is not None:
+            self._tap(Direction.TURN, said.sent_ns, "")
+        to_come = True
+        for item in said.source.requests(said.sent_ns):
+            if to_come and item == said.item:
+                to_come = False
+                if self._tap is not None:
+                    self._tap(Direction.OUT, said.sent_ns, item)
+            else:
+                self._send(port, (item,), said.sent_ns)
+        said.source.plan(said.sent_ns)
 
     def _is_amid(self) -> bool:
         """Whether the rest of a message is on its way, and no conversation has anything to ask before that."""
@@ -286,7 +318,7 @@ class WireReader(Generic[WireT]):
         if items:
             self._backoff.reset()
 
-    def _hear_out(self, now_ns: int, heard_out_ns: int, wait_ns: int) -> None:
+    def _hear_out(self, due: Iterable[_Source[WireT]], now_ns: int, heard_out_ns: int, wait_ns: int) -> None:
         """Silence, as far as it was surely heard: whatever came until heard_out_ns was read in this turn.
 
         wait_ns: how long the turn meant to take. What it took beyond, this thread was held up: it neither listened nor
@@ -295,10 +327,13 @@ class WireReader(Generic[WireT]):
         done_ns = self._clock()
         late_ns = done_ns - self._turned_ns - wait_ns
         held_up_ns = late_ns if late_ns > _HELD_UP_NS else 0
-        for source in self._sources:
+        for source in due:
             source.check(now_ns, min(heard_out_ns, done_ns - held_up_ns))
-            if held_up_ns:
+        if held_up_ns:
+            for source in self._sources:
                 source.forgive(held_up_ns, done_ns)
+        for source in due:
+            source.plan(now_ns)
         self._turned_ns = done_ns
 
     def _send(self, port: Port[WireT], items: Iterable[WireT | SetBaudRate], now_ns: int) -> None:
@@ -345,11 +380,20 @@ class WireReader(Generic[WireT]):
         port.close()
 
 
+@dataclass(frozen=True, slots=True)
+class _Said(Generic[WireT]):
+    """What a source had prepared and was sent, and when."""
+
+    source: _Source[WireT]
+    item: WireT
+    sent_ns: int
+
+
 class _Source(Generic[WireT]):
     """One conversation with what the loop keeps about it. Pure but for the sink and the log."""
 
     def __init__(
-        self, name: str, conversation: Conversation[WireT], sink: Sink, rated_log: _RateLimitedLog, tap: Tap | None
+        self, name: str, conversation: Conversation[WireT], sink: Sink, rated_log: RateLimitedLog, tap: Tap | None
     ) -> None:
         self.name = name
         self._conversation: Conversation[WireT] = conversation
@@ -358,11 +402,16 @@ class _Source(Generic[WireT]):
         self._tap = tap
         self._next_request: Callable[[], int | None] | None = getattr(conversation, "next_request_ns", None)
         self._amid: Callable[[], bool] | None = getattr(conversation, "is_amid", None)
+        self._hears: Callable[[WireT], bool] | None = getattr(conversation, "hears", None)
         self._has_heard = False  # since it was last asked what it has to say
+        self._tells = False  # it runs, and said when it has something to say
+        self.next_ns = 0  # until then, and if it hears nothing, no turn is needed for it
+        self._prepare: Callable[[], WireT | None] | None = getattr(conversation, "prepared", None)
+        self.prepared: WireT | None = None  # what it will say then, if it hears nothing
         self._wire_trouble: str | None = "not opened yet"
         self._loop_trouble: str | None = None  # what the loop found wrong: silence, a bug
         self._broken_until_ns: int | None = None  # after a bug: left alone until then
-        self._restart_backoff = _Backoff()
+        self._restart_backoff = Backoff()
         self._life_ns = 0  # last reading, or when RUNNING was entered
         self._alive_ns = 0  # the same, and what was forgiven since
         self._longest_ns = 0  # the longest that was forgiven since
@@ -376,9 +425,9 @@ class _Source(Generic[WireT]):
         self._restarts = 0
         self._bugs = 0
         self._last_reading_ns: int | None = None
-        self._rate = _Rate()
-        self._usual = _UsualPeriod()
-        self._hold_ups = _HoldUps()
+        self._rate = Rate()
+        self._usual = UsualPeriod()
+        self._hold_ups = HoldUps()
         self._limit_ns = MOST_SILENCE_NS  # as last looked at
 
     # ---- what the loop tells
@@ -401,9 +450,10 @@ class _Source(Generic[WireT]):
         self._tell_safely(now_ns)
 
     def receive(self, item: WireT, stamp_ns: int) -> None:
-        if self._broken_until_ns is not None:
+        if self._broken_until_ns is not None or (self._hears is not None and not self._hears(item)):
             return
         self._has_heard = True
+        self.prepared = None
         try:
             for reading in self._conversation.receive(item, stamp_ns):
                 self._note_reading(stamp_ns)
@@ -412,9 +462,10 @@ class _Source(Generic[WireT]):
             self._note_bug(stamp_ns, error)
 
     def requests(self, now_ns: int) -> Iterable[WireT | SetBaudRate]:
-        if self._broken_until_ns is not None or (not self._has_heard and self.next_request_ns(now_ns) > now_ns):
-            return ()
         self._has_heard = False
+        self.prepared = None
+        if self._broken_until_ns is not None:
+            return ()
         try:
             items: Iterable[WireT | SetBaudRate] = self._conversation.requests(now_ns)
         except Exception as error:
@@ -430,7 +481,22 @@ class _Source(Generic[WireT]):
             return ()
         return items
 
-    def next_request_ns(self, poll_ns: int) -> int:
+    def is_due(self, now_ns: int) -> bool:
+        """Whether this turn concerns it. A turn touches no more than it must: after each wait all of it is cold."""
+        return self._has_heard or not self._tells or now_ns >= self.next_ns
+
+    def plan(self, now_ns: int) -> None:
+        """After a turn that concerned it: when the next one does."""
+        self._tells = (
+            self._next_request is not None and self._seen_state is LinkState.RUNNING and self._broken_until_ns is None
+        )
+        request_ns = self._next_request_ns(now_ns + POLL_PERIOD_NS)
+        self.next_ns = min(request_ns, self.silent_from_ns(now_ns + LONGEST_TURN_NS))
+        self.prepared = None
+        if self._tells and self._prepare is not None and self.next_ns == request_ns:
+            self.prepared = self._prepare()
+
+    def _next_request_ns(self, poll_ns: int) -> int:
         """When requests() should be called next; a conversation that keeps a beat says so, others are polled, and all
         while they are set up."""
         if self._next_request is None or self._broken_until_ns is not None:
@@ -552,6 +618,8 @@ class _Source(Generic[WireT]):
     def _restart(self, now_ns: int) -> None:
         self._restarts += 1
         self._setup_ns = now_ns
+        self.next_ns = now_ns
+        self.prepared = None
         if self._tap is not None:
             self._tap(Direction.CONNECTED, now_ns, self.name)
         try:
@@ -574,7 +642,7 @@ class _Source(Generic[WireT]):
         """Called while handling the exception. The conversation is left alone for a second, then restarted."""
         self._bugs += 1
         self._conversation.counters.drop("bug")
-        self._broken_until_ns = now_ns + _LONGEST_BACKOFF_NS
+        self._broken_until_ns = now_ns + LONGEST_BACKOFF_NS
         self._loop_trouble = f"internal error, {type(error).__name__}: {error} (a bug: please report it with the log)"
         self._log.exception(now_ns, f"{self.name}: {type(error).__name__}", "%s: %s", self.name, self._loop_trouble)
         self._tell(now_ns)
@@ -632,130 +700,6 @@ _WORDS = {
 
 def _words(state: LinkState) -> str:
     return _WORDS[state]
-
-
-class _Backoff:
-    """When to try next: at once, then after 0.1 s, doubling to 1 s, for ever."""
-
-    def __init__(self) -> None:
-        self.due_ns = 0
-        self._wait_ns = _FIRST_BACKOFF_NS
-
-    def next(self, now_ns: int) -> None:
-        """An attempt was made (or the wire lost) now."""
-        self.due_ns = now_ns + self._wait_ns
-        self._wait_ns = min(2 * self._wait_ns, _LONGEST_BACKOFF_NS)
-
-    def reset(self) -> None:
-        """It worked: the next loss is a new one."""
-        self._wait_ns = _FIRST_BACKOFF_NS
-
-    def note_life(self, now_ns: int) -> None:
-        """Like reset, but only after it has worked for longer than the longest wait."""
-        if now_ns > self.due_ns + _LONGEST_BACKOFF_NS:
-            self.reset()
-
-
-class _Rate:
-    """Readings a second, over windows of about one second."""
-
-    def __init__(self) -> None:
-        self._window_ns: int | None = None
-        self._count = 0
-        self._hz = 0.0
-        self._last_ns = 0
-
-    def count(self, stamp_ns: int) -> None:
-        self._last_ns = stamp_ns
-        if self._window_ns is None:
-            self._window_ns, self._count = stamp_ns, 0
-            return
-        self._count += 1
-        elapsed_ns = stamp_ns - self._window_ns
-        if elapsed_ns >= 1_000_000_000:
-            self._hz = self._count * 1e9 / elapsed_ns
-            self._window_ns, self._count = stamp_ns, 0
-
-    def hz(self, now_ns: int) -> float:
-        if self._window_ns is None or now_ns - self._last_ns > 2_000_000_000:
-            return 0.0
-        if self._hz == 0.0 and self._last_ns > self._window_ns:  # within the first second
-            return self._count * 1e9 / (self._last_ns - self._window_ns)
-        return self._hz
-
-
-class _UsualPeriod:
-    """The third quartile of the newest intervals between readings; 0 until there are enough.
-
-    One pause does not move it, and of readings that come in pairs it is the wait for the next pair.
-    """
-
-    def __init__(self) -> None:
-        self.period_ns = 0
-        self._last_ns: int | None = None
-        self._intervals: deque[int] = deque(maxlen=_INTERVALS_KEPT)
-
-    def count(self, stamp_ns: int) -> None:
-        if self._last_ns is not None:
-            self._intervals.append(stamp_ns - self._last_ns)
-            if len(self._intervals) == _INTERVALS_KEPT:
-                self.period_ns = sorted(self._intervals)[_INTERVALS_KEPT * 3 // 4]
-        self._last_ns = stamp_ns
-
-
-class _HoldUps:
-    """How long readings were lately held back on their way: by a hub, an adapter, a scheduler that had other work.
-
-    limit_ns: below it a wait is nothing new; 60 ms until enough readings came. Longer waits were silence and teach
-    nothing. Only sources with periods below 20 ms have limits so short. It is the largest wait of the last 10 to 20 s.
-    """
-
-    def __init__(self) -> None:
-        self.limit_ns = _HOLD_UPS_NS
-        self._began_ns = 0
-        self._count = 0
-        self._past_ns = 0
-        self._most_ns = 0
-
-    def count(self, stamp_ns: int, wait_ns: int) -> None:
-        if wait_ns > _HOLD_UPS_NS:
-            return
-        self._count += 1
-        self._most_ns = max(self._most_ns, wait_ns)
-        if self._count < _READINGS_TO_KNOW:
-            return
-        if stamp_ns - self._began_ns > _HOLD_UPS_KEPT_NS:
-            self._began_ns, self._past_ns, self._most_ns = stamp_ns, self._most_ns, wait_ns
-        self.limit_ns = min(round(_HOLD_UP_MARGIN * max(self._past_ns, self._most_ns)), _HOLD_UPS_NS)
-
-
-class _RateLimitedLog:
-    """One line per cause per minute; the next line of that cause tells how many were kept back."""
-
-    def __init__(self) -> None:
-        self._last: dict[str, tuple[int, int]] = {}  # cause -> (when told, kept back since)
-
-    def say(self, now_ns: int, cause: str, level: int, text: str) -> bool:
-        kept_back = self._due(now_ns, cause)
-        if kept_back is not None:
-            log.log(level, "%s%s", text, f" (and {kept_back} times more since last told)" if kept_back else "")
-        return kept_back is not None
-
-    def forget(self, cause: str) -> None:
-        """The next line of this cause is told at once."""
-        self._last.pop(cause, None)
-
-    def exception(self, now_ns: int, cause: str, text: str, *args: object) -> None:
-        if self._due(now_ns, cause) is not None:
-            log.exception(text, *args)
-
-    def _due(self, now_ns: int, cause: str) -> int | None:
-        told_ns, kept_back = self._last.get(cause, (None, 0))
-        if told_ns is not None and now_ns - told_ns < _LOG_PERIOD_NS:
-            self._last[cause] = (told_ns, kept_back + 1)
-            return None
-        self._last[cause] = (now_ns, 0)
-        return kept_back
 
 
 def _add(total: dict[str, int], more: dict[str, int]) -> None:

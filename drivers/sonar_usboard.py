@@ -566,6 +566,10 @@ class UsBoardConversation(_UsBoardLink):
     def connected(self, now_ns: int) -> None:
         self._board.connected(now_ns)
 
+    def hears(self, chunk: CanFrame) -> bool:
+        """Whether a frame is of this board."""
+        return 1 <= chunk.can_id - self._base_id <= 16
+
     def receive(self, chunk: CanFrame, stamp_ns: int) -> Iterator[Reading]:
         offset = chunk.can_id - self._base_id
         if not 1 <= offset <= 16 or chunk.extended is not self._extended:

@@ -837,3 +837,22 @@ def test_an_axle_tells_its_absolute_angle_below_zero_and_through_turns() -> None
     assert told[-1].ticks > 10_000, "on past half a turn"
     assert all(truth - each.ticks >= 0 for each in told)
     assert abs(told[-1].ticks - truth) <= 7 * 12
+
+
+def test_what_is_prepared_is_what_is_said_when_it_is_due() -> None:
+    """The reader sends it before it asks for it; in the middle a node does not answer."""
+    bench = Bench()
+    bench.run(1000)
+    kept = 0
+    for step in range(3000):
+        bench.nodes[0].answers_sync = not 1000 <= step < 1300
+        prepared, is_due = bench.pair.prepared(), bench.pair.next_request_ns() <= bench.now_ns
+        before = len(bench.sent)
+        bench.run(1)
+        if prepared is not None and is_due:
+            assert [frame for _, frame in bench.sent[before:]].count(prepared) == 1
+            kept += 1
+    assert kept > 250, "a hundred a second, but for the pause"
+    for frame in (CanFrame(0x280 + LEFT), CanFrame(0x700 + RIGHT), CanFrame(0x80)):
+        assert bench.pair.hears(frame)
+    assert not bench.pair.hears(CanFrame(0x401))

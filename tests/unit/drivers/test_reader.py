@@ -237,6 +237,11 @@ class Telling(Talker):
         self.amid = not chunk.endswith(b"!")
         return super().receive(chunk, stamp_ns)
 
+    def requests(self, now_ns: int) -> Sequence[bytes | SetBaudRate]:
+        if now_ns >= self.due_ns:
+            self.due_ns = 1 << 62
+        return super().requests(now_ns)
+
     def next_request_ns(self) -> int:
         return self.due_ns
 
@@ -302,17 +307,106 @@ def test_pieces_of_a_message_cost_one_turn() -> None:
 
 def test_a_message_that_never_ends_holds_up_no_question() -> None:
     bench = telling_bench((100, b"!"), *((ms, b"a") for ms in range(150, 400, 3)))
-    bench.run_until(160)
-    bench.talker.requested_at.clear()
-    assert isinstance(bench.talker, Telling)
-    bench.talker.due_ns = 210 * MS
+    talker = bench.talker
+    assert isinstance(talker, Telling)
+    talker.due_ns = 210 * MS
     bench.run_until(212)
-    assert 210 * MS in bench.talker.requested_at
-    bench.talker.due_ns = 1 << 62
-    bench.talker.requested_at.clear()
+    assert 210 * MS in talker.requested_at
+    talker.requested_at.clear()
     bench.run_until(390)
-    asked = bench.talker.requested_at
+    asked = talker.requested_at
     assert max(b - a for a, b in pairwise(asked)) <= LONGEST_TURN_NS + MS
+
+
+class Asking(Telling):
+    """Asks `?` every 10 ms once the last one was answered, and has it prepared."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.due_ns = 10 * MS
+        self.open = False
+        self.more: list[bytes | SetBaudRate] = []
+
+    def receive(self, chunk: bytes, stamp_ns: int) -> Iterator[Reading]:
+        assert self.open, "an answer is heard behind its question"
+        self.open = False
+        return super().receive(chunk, stamp_ns)
+
+    def requests(self, now_ns: int) -> Sequence[bytes | SetBaudRate]:
+        self.requested_at.append(now_ns)
+        if self.open or now_ns < self.due_ns:
+            return []
+        self.open, self.due_ns = True, self.due_ns + 10 * MS
+        more, self.more = self.more, []
+        return [*more, b"?"]
+
+    def next_request_ns(self) -> int:
+        return self.due_ns + 20 * MS if self.open else self.due_ns
+
+    def prepared(self) -> bytes | None:
+        return None if self.open else b"?"
+
+
+def test_what_is_prepared_leaves_on_time_once_and_is_asked_for_before_its_answer_is_heard() -> None:
+    heard: list[tuple[Direction, int, object]] = []
+    bench = Bench(tap=lambda *event: heard.append(event))
+    asking = Asking()
+    bench.reader = WireReader(
+        "bench", bench.open, {"drive": asking}, bench.sink, clock=lambda: bench.now_ns, wait=bench.wait,
+        tap=lambda *event: heard.append(event),
+    )  # fmt: skip
+    sent_at: list[int] = []
+    write = ScriptedPort.write
+
+    def answered(port: ScriptedPort, item: bytes) -> None:
+        write(port, item)
+        if item == b"?":
+            sent_at.append(bench.now_ns)
+            bench.plan.append((bench.now_ns + 2 * MS, lambda: bench.say(b"!")))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ScriptedPort, "write", answered)
+        bench.run_until(500)
+        asking.more = [b"too"]
+        bench.run_until(1000)
+    assert [at // MS for at in sent_at] == list(range(10, 1001, 10))
+    assert bench.port.done.count(b"too") == 1
+    assert bench.readings("drive") == len(sent_at) - (1 if asking.open else 0)
+    turns = [at for direction, at, _ in heard if direction is Direction.TURN]
+    late = [at // MS for at in turns if at > 105 * MS]
+    assert late[:6] == [110, 112, 120, 122, 130, 132], "one turn to ask, one for the answer"
+    out = [(at, item) for direction, at, item in heard if direction is Direction.OUT and at > 100 * MS]
+    assert [at for at, item in out if item == b"?"] == [at for at in sent_at if at > 100 * MS]
+    order = [(direction, at // MS) for direction, at, _ in heard if 200 * MS <= at < 210 * MS]
+    assert order == [(Direction.TURN, 200), (Direction.OUT, 200), (Direction.IN, 202), (Direction.TURN, 202)]
+
+
+def test_what_is_not_for_a_conversation_is_not_given_to_it_and_needs_no_turn_of_it() -> None:
+    class Choosy(Telling):
+        def __init__(self, mark: bytes) -> None:
+            super().__init__()
+            self.mark = mark
+            self.heard: list[bytes] = []
+
+        def hears(self, chunk: bytes) -> bool:
+            return chunk.startswith(self.mark)
+
+        def receive(self, chunk: bytes, stamp_ns: int) -> Iterator[Reading]:
+            self.heard.append(chunk)
+            return super().receive(chunk, stamp_ns)
+
+    bench = Bench()
+    left, right = Choosy(b"l"), Choosy(b"r")
+    bench.reader = WireReader(
+        "bench", bench.open, {"left": left, "right": right}, bench.sink, clock=lambda: bench.now_ns, wait=bench.wait
+    )
+    bench.plan = [(ms * MS, partial(bench.say, b"l!" if ms % 20 else b"r!")) for ms in range(100, 400, 10)]
+    bench.run_until(395)
+    assert left.heard == [b"l!"] * 15
+    assert right.heard == [b"r!"] * 15
+    assert {at // MS % 20 for at in left.requested_at if at > 200 * MS} == {10}
+    assert {at // MS % 20 for at in right.requested_at if at > 200 * MS} == {0}
+    assert bench.states("left")[-1] is bench.states("right")[-1] is LinkState.RUNNING
 
 
 def test_what_came_while_the_thread_was_held_up_is_heard_before_anything_is_asked() -> None:
