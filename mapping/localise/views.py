@@ -189,7 +189,7 @@ class ViewStore:
     def _put(self, view: View) -> int:
         rows, bins = self._arrays[0].shape
         if self._rows == rows or view.table.bins > bins:
-            self._grow(rows if self._rows < rows else max(64, rows + rows // 2), max(bins, view.table.bins))
+            self._grow(rows if self._rows < rows else max(64, rows + rows // 4), max(bins, view.table.bins))
         row, width = self._rows, view.table.bins
         for kept, new in zip(self._arrays, (view.x, view.y, view.nx, view.ny, view.quality)):
             kept[row, :width] = new
