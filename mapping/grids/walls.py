@@ -19,6 +19,7 @@ through ever after is none. Costs: a walk along every beam, and sorting the cell
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,7 @@ I64 = NDArray[np.int64]
 
 AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)], dtype=np.int64)
 EXPLAINED = np.array([(0, 0), (-1, 0), (0, -1), (0, 1), (1, 0)], dtype=np.int64)
+PIECE = 1 << 16
 NEIGHBOURS = 2  # cells from an end whose counts matter: a wall may lie beside it, and is blurred over its neighbours
 HALF_A_BEAM = 0.5  # the cost of a cell that nothing passed
 
@@ -131,10 +133,7 @@ class BeamCounts:
         side = math.exp(-0.5 / rules.blur_cells**2)
         weights = np.array([side, 1.0, side]) / (1.0 + 2.0 * side)
         weight = np.outer(weights, weights).ravel()
-        ends, passes = (
-            sum(w * self._at(counts, cells + offset) for w, offset in zip(weight, AROUND))
-            for counts in (self._ends, self._passes)
-        )
+        ends, passes = (self._blurred(counts, cells, weight) for counts in (self._ends, self._passes))
         ended, passed = self._at(self._ends, cells), self._at(self._passes, cells)
         cost = np.where(ended > 0.0, passes + HALF_A_BEAM, np.inf)
         chosen = np.zeros(len(cells), dtype=np.bool_)
@@ -142,16 +141,32 @@ class BeamCounts:
         chosen |= (ended > 0.0) & (ended >= rules.surely_per_pass * (passed + HALF_A_BEAM))
         return cells[chosen]
 
+    def _blurred(self, counts: NDArray[np.uint16], cells: I64, weight: F64) -> F64:
+        """Counts (N,) of cells (N, 2) and those AROUND them, by weight (9,)."""
+        out = np.zeros(len(cells))
+        for some in _pieces(len(cells)):
+            for w, offset in zip(weight, AROUND):
+                out[some] += w * self._at_some(counts, cells[some] + offset)
+        return out
+
     def _cells_near_ends(self) -> I64:
         """(N, 2) cells in or beside which beams end, by rows and columns."""
         at = np.flatnonzero(self._ends)
         tile, local = self._table.places[at // TILE_CELLS], at % TILE_CELLS
         hit = tile * TILE + np.stack((local // TILE, local % TILE), axis=-1)
-        keys = _keys(hit)
-        return _cells_of_keys(np.unique(np.concatenate([keys + _key_step(offset) for offset in AROUND])))
+        keys = np.unique(_keys(hit))
+        for step in (_key_step(1, 0), _key_step(0, 1)):
+            keys = np.unique(np.concatenate((keys - step, keys, keys + step)))
+        return _cells_of_keys(keys)
 
     def _at(self, counts: NDArray[np.uint16], cells: I64) -> F64:
         """Counts (N,) of cells (N, 2), 0 where no tile is."""
+        out = np.empty(len(cells))
+        for some in _pieces(len(cells)):
+            out[some] = self._at_some(counts, cells[some])
+        return out
+
+    def _at_some(self, counts: NDArray[np.uint16], cells: I64) -> NDArray[np.uint16]:
         index = self._table.index
         at = (cells >> TILE_BITS) - (self._table.row0, self._table.col0)
         inside = np.all((at >= 0) & (at < index.shape), axis=1)
@@ -159,7 +174,12 @@ class BeamCounts:
         tile[inside] = index[at[inside, 0], at[inside, 1]]
         local = cells & TILE_MASK
         cell = tile * TILE_CELLS + local[:, 0] * TILE + local[:, 1]
-        return np.where(tile >= 0, counts[np.maximum(cell, 0)], 0).astype(np.float64)
+        return np.where(tile >= 0, counts[np.maximum(cell, 0)], 0)
+
+
+def _pieces(count: int) -> Iterator[slice]:
+    """A row of so many, PIECE at a time: there may be millions, and a step takes several times their memory."""
+    return (slice(first, first + PIECE) for first in range(0, count, PIECE))
 
 
 def _keys(cells: I64) -> I64:
@@ -167,9 +187,9 @@ def _keys(cells: I64) -> I64:
     return np.asarray((cells[:, 0] << 32) + cells[:, 1] + (1 << 31))
 
 
-def _key_step(offset: I64) -> int:
-    """What an offset (2,) adds to a cell's key."""
-    return (int(offset[0]) << 32) + int(offset[1])
+def _key_step(rows: int, columns: int) -> int:
+    """What so many rows and columns add to a cell's key."""
+    return (rows << 32) + columns
 
 
 def _cells_of_keys(keys: I64) -> I64:
@@ -180,8 +200,9 @@ def _numbers_of(cells: I64, offsets: I64) -> NDArray[np.int32]:
     """(N, K) number of the cell at each offset from each cell, -1 where it is none of them. cells: by rows."""
     keys = _keys(cells)
     numbers = np.empty((len(cells), len(offsets)), dtype=np.int32)
-    for k, offset in enumerate(offsets):  # one at a time: there may be a million cells
-        wanted = keys + _key_step(offset)
-        found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        numbers[:, k] = np.where(keys[found] == wanted, found, -1)
+    for some in _pieces(len(cells)):
+        for k, (row, column) in enumerate(offsets.tolist()):
+            wanted = keys[some] + _key_step(row, column)
+            found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+            numbers[some, k] = np.where(keys[found] == wanted, found, -1)
     return numbers

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.grids import walls
 from mapping.grids.evidence import Model
 from mapping.grids.occupancy import FREE, OCCUPIED, PARTLY_FREE, UNKNOWN, OccupancyGrid
 from mapping.grids.walls import BeamCounts, EndTiles, WallRules
@@ -132,6 +133,15 @@ def test_counts_that_are_full_keep_their_ratio() -> None:
     ended, passed = counts._at(counts._ends, cell)[0], counts._at(counts._passes, cell)[0]
     assert 16_000 < passed < 65_536
     assert ended / passed == pytest.approx(2.0, rel=0.01)
+
+
+def test_walls_are_found_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    scans = drive(0.04, 3)
+    counts = counts_of(grid_of(scans), scans)
+    whole = counts.walls()
+    assert len(whole) > 100
+    monkeypatch.setattr(walls, "PIECE", 7)
+    np.testing.assert_array_equal(counts.walls(), whole)
 
 
 def test_tiles_without_ends_need_not_be_counted_in() -> None:
