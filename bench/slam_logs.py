@@ -125,9 +125,6 @@ DRIFTING = Wheels(way_share=0.05, turn_share=0.12, drift_rad_per_m=math.radians(
 
 CASES: dict[str, Case] = {
     "court": Case(lambda s: corridors(COURT, s), Form(hertz=8.0, noise_m=0.02)),
-    "court8": Case(
-        lambda s: corridors(COURT, s, walkers=True), Form(hertz=2.5, reach_m=8.0, code_m=8.0, stamp_digits=2)
-    ),
     "cellar": Case(lambda s: corridors(CELLAR, s), Form(reach_m=8.0, code_m=8.19, wheels=SLIPPERY)),
     "school": Case(
         lambda s: corridors(SCHOOL, s, walkers=True),
