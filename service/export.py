@@ -29,6 +29,7 @@ F64 = NDArray[np.float64]
 GRID_FORMATS = ("png", "pgm", "npy", "json")
 OCCUPIED_THRESHOLD = 0.65
 FREE_THRESHOLD = 0.196
+_BAND = 128  # lines of a picture made at once
 _FREE_PIXEL, _UNKNOWN_PIXEL, _OCCUPIED_PIXEL = 254, 205, 0
 _SIDE_MAX = 65_535
 _CELLS_MAX = 400_000_000
@@ -89,15 +90,18 @@ def patch_of(image: MapImage, resolution_m: float | None = None) -> GridPatch:
 def pixels_of(cells: I8) -> U8:
     """Cells as picture lines: 0 occupied from 65 %, 254 free below 19.6 %, 205 otherwise; uppermost line first."""
     pixels = np.full(cells.shape, _UNKNOWN_PIXEL, dtype=np.uint8)
-    pixels[(cells >= 0) & (cells < 100 * FREE_THRESHOLD)] = _FREE_PIXEL
-    pixels[cells >= 100 * OCCUPIED_THRESHOLD] = _OCCUPIED_PIXEL
-    return np.ascontiguousarray(pixels[::-1])
+    upside_down = cells[::-1]
+    for first in range(0, len(cells), _BAND):  # a map may have a hundred million cells
+        band, out = upside_down[first : first + _BAND], pixels[first : first + _BAND]
+        out[(band >= 0) & (band < 100 * FREE_THRESHOLD)] = _FREE_PIXEL
+        out[band >= 100 * OCCUPIED_THRESHOLD] = _OCCUPIED_PIXEL
+    return pixels
 
 
 def pgm_bytes(cells: I8) -> bytes:
     """A binary PGM (P5) picture."""
     rows, columns = cells.shape
-    return b"P5\n%d %d\n255\n" % (columns, rows) + pixels_of(cells).tobytes()
+    return b"".join((b"P5\n%d %d\n255\n" % (columns, rows), pixels_of(cells).reshape(-1).data))
 
 
 def png_bytes(cells: I8) -> bytes:

@@ -319,6 +319,8 @@ def report_of(built: Built, patch: GridPatch, source: PoseSource) -> dict[str, o
     """Counts, timings, memory, and the judgement of held-out scans."""
     provenance = built.log.provenance
     area = patch.resolution_m**2
+    occupied = sum(int(np.count_nonzero(row >= OCCUPIED_FROM_PERCENT)) for row in patch.cells)
+    free = sum(int(np.count_nonzero(row >= 0)) for row in patch.cells) - occupied
     report: dict[str, object] = {
         "log": {"path": provenance.path, "dialect": provenance.dialect, "sha256": provenance.sha256},
         "poses": source.value,
@@ -331,8 +333,8 @@ def report_of(built: Built, patch: GridPatch, source: PoseSource) -> dict[str, o
         "stamps_made_up": built.log.stamps_made_up,
         "resolution_m": patch.resolution_m,
         "cells": {"rows": patch.cells.shape[0], "columns": patch.cells.shape[1]},
-        "free_m2": float(np.sum((patch.cells >= 0) & (patch.cells < OCCUPIED_FROM_PERCENT)) * area),
-        "occupied_m2": float(np.sum(patch.cells >= OCCUPIED_FROM_PERCENT) * area),
+        "free_m2": float(free * area),
+        "occupied_m2": float(occupied * area),
         "lines": len(built.line_map.lines(min_seen=2)),
         "refused_tiles": built.grid.refused_tiles,
         "seconds": {name: round(value, 3) for name, value in built.seconds.items()},
