@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2, wrap_angle
-from mapping.localise.calibrate import Calibration, RobotModel, calibrate, rolled_back
+from mapping.localise.calibrate import Calibration, RobotModel, calibrate, rolled_back, turns_as_believed
 from mapping.localise.relative_motions import (
     TURN_RAD,
     LaserMotion,
@@ -28,7 +28,7 @@ from mapping.localise.relative_motions import (
 )
 from mapping.odometry import DriveGeometry
 from mapping.scan import Scan, seen_from
-from service.calibration_report import advice_of, report_of
+from service.calibration_report import advice_of, contradiction_of, report_of
 from service.map_makers import MapView, Tile
 from service.outputs import DocumentOut, OdomOut, Output
 
@@ -60,6 +60,7 @@ class _Laser:
     rest_until_ns: int = 0
     new: int = 0
     found: Calibration | None = None
+    turns_as_believed: tuple[bool, bool] | None = None
 
 
 class CalibrationMaker:
@@ -134,7 +135,9 @@ class CalibrationMaker:
             laser.new = 0
             believed = self._believed(laser)
             ticks = rolled_back(*self._way.rows(), believed)
-            laser.found = calibrate(ticks, joined_motions(tuple(laser.motions), laser.meter.rejected), believed)
+            motions = joined_motions(tuple(laser.motions), laser.meter.rejected)
+            laser.found = calibrate(ticks, motions, believed)
+            laser.turns_as_believed = turns_as_believed(ticks, motions, believed)
         return [DocumentOut(KEY, view.stamp_ns, self._fields())] if due else []
 
     def changed_tiles(self) -> list[Tile]:
@@ -159,17 +162,23 @@ class CalibrationMaker:
             if laser.found is None:
                 continue
             believed = self._believed(laser)
-            advice = advice_of(laser.found, believed, laser=self._sections[source], ticks_per_turn=ticks_per_turn)
+            section = self._sections[source]
+            wrong = contradiction_of(laser.turns_as_believed, laser=section, ticks_per_turn=ticks_per_turn)
+            advice = []  # with a sign that is wrong the numbers mean nothing
+            if wrong is None:
+                advice = advice_of(laser.found, believed, laser=section, ticks_per_turn=ticks_per_turn)
             lasers[source] = report_of(
                 laser.found, believed, rejected=laser.meter.rejected, has_ticks=True, ticks_per_turn=ticks_per_turn
-            ) | {"advice": advice}
-            self._say(source, advice)
+            ) | {"contradiction": wrong, "advice": advice}
+            self._say(source, wrong, advice)
         return {"lasers": lasers}
 
-    def _say(self, source: str, advice: list[dict[str, object]]) -> None:
+    def _say(self, source: str, wrong: str | None, advice: list[dict[str, object]]) -> None:
         """One line in the log when the settings change that should be looked at."""
-        settings = tuple(each["setting"] for each in advice)
-        if settings and settings != self._told.get(source):
+        settings = (wrong,) if wrong is not None else tuple(each["setting"] for each in advice)
+        if wrong is not None and settings != self._told.get(source):
+            log.warning("calibration by %s: %s", source, wrong)
+        elif settings and settings != self._told.get(source):
             lines = ", ".join(
                 f"{each['setting']} = {each['value']} ± {each['deviation']} instead of {each['instead_of']}"
                 for each in advice

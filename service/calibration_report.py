@@ -12,6 +12,7 @@ from mapping.localise.umbmark import SIDE_M, square_end
 NOT_OBSERVABLE = "not observable yet"
 
 _SIGMAS = 3.0
+_YAW = NAMES.index("laser_yaw_rad")
 # Less than this is not worth a line in the configuration: shares of the first three, metres, radians, seconds.
 _WORTH = np.array([0.003, 0.003, 0.005, 0.005, 0.005, math.radians(0.3), math.inf])
 
@@ -61,6 +62,8 @@ def advice_of(
     """Settings that the drive contradicts: three deviations off and by more than 0.3 % (radii), 0.5 % (track), 5 mm
     or 0.3 degrees. laser: the section of its configuration."""
     off = found.best - believed.row()
+    off[_YAW] = math.remainder(off[_YAW], 2.0 * math.pi)  # 180 degrees are -180
+    best = believed.row() + off
     worth = _WORTH * np.concatenate((np.abs(believed.row()[:3]), np.ones(4)))
     contradicted = found.observable & (np.abs(off) > _SIGMAS * found.deviation) & (np.abs(off) > worth)
     radii = [abs(ticks) / (2.0 * math.pi) for ticks in ticks_per_turn]
@@ -77,13 +80,30 @@ def advice_of(
     return [
         {
             "setting": setting,
-            "value": round(size[k](float(found.best[k])) * unit, digits),
+            "value": round(size[k](float(best[k])) * unit, digits),
             "deviation": float(f"{found.deviation[k] * unit:.2g}"),
             "instead_of": round(size[k](float(believed.row()[k])) * unit, digits),
         }
         for k, (setting, unit, digits) in enumerate(settings)
         if contradicted[k]
     ]
+
+
+def contradiction_of(
+    as_believed: tuple[bool, bool] | None, *, laser: str, ticks_per_turn: tuple[float, float]
+) -> str | None:
+    """What no number puts right, in words: see `calibrate.turns_as_believed`. laser: the section of its
+    configuration."""
+    if as_believed is None or all(as_believed):
+        return None
+    if not any(as_believed):
+        return (
+            f"{laser} turns the other way than the wheels say: is {laser}.mount.upside_down wrong, are the left and "
+            "the right wheel exchanged, or do both count backwards (drive.ticks_per_turn_left and _right)?"
+        )
+    k = as_believed.index(False)
+    side = ("left", "right")[k]
+    return f"the {side} wheel counts backwards: drive.ticks_per_turn_{side} = {-ticks_per_turn[k]:g}"
 
 
 def _umbmark(found: Calibration, believed: RobotModel) -> dict[str, object] | None:

@@ -112,8 +112,11 @@ class LiveMap:
     def finish(self) -> None:
         """The last snapshot, and a whole copy as the newest generation."""
         self._ask(self._fusion.drain)
-        if self._store is not None and self.snapshot():
-            self._store.keep_generation()
+        if self._store is None:
+            return
+        if not self.snapshot():
+            raise Trouble(self.trouble() or f"{self._store.path}: not saved")
+        self._store.keep_generation()
 
     def _meta(self, pose: Pose2 | None) -> dict[str, Any]:
         grid = self._layer.grid

@@ -19,7 +19,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,13 +119,15 @@ class Redrawn:
 @dataclass(frozen=True, slots=True)
 class RedrawState:
     """What is kept for drawing again, to be stored. drawn: (N, 2, 3) as in Job.  serials: (N,) numbers that rise and
-    are never used again; next_serial comes next.  base: tiles under it all."""
+    are never used again; next_serial comes next.  base: tiles under it all.  mounts: base_from_sensor (3,) of each
+    laser when its sweeps were taken, as it was configured then."""
 
     kept: tuple[Kept, ...]
     drawn: F64
     serials: NDArray[np.int64]
     next_serial: int
     base: Mapping[Place, bytes]
+    mounts: Mapping[str, F64] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +151,7 @@ class Redrawer:
         """mounts: base_from_sensor of every laser.  submit: where jobs are done."""
         self._building = building
         self._around = [layer for layer in layers if isinstance(layer, FollowsCorrections)]
-        self._mounts = {name: np.array([p.x_m, p.y_m, p.yaw_rad]) for name, p in mounts.items()}
+        self._mounts = {name: _row(mount) for name, mount in mounts.items()}
         self._submit = submit
         self._kept: list[Kept] = []
         self._serial: list[int] = []  # of what is kept: rises
@@ -246,15 +248,29 @@ class Redrawer:
         """As of now."""
         serials = np.array(self._serial, dtype=np.int64)
         return RedrawState(
-            tuple(self._kept), self._drawn[: len(self._kept)].copy(), serials, self._next_serial, self._base
-        )
+            tuple(self._kept), self._drawn[: len(self._kept)].copy(), serials, self._next_serial, self._base,
+            dict(self._mounts),
+        )  # fmt: skip
 
     def resume(self, state: RedrawState) -> None:
-        """Take up what was kept of the map that is there now."""
+        """Take up what was kept of the map that is there now.
+
+        Where a laser's mount was configured otherwise then, its sweeps stay where they were seen: by the mount of
+        today they were taken from other poses of the base.
+        """
         self.start_over()
         self._base = dict(state.base)
+        otherwise = {
+            name: composed_poses(then, _inverse_of(self._mounts[name]))
+            for name, then in state.mounts.items()
+            if name in self._mounts and not np.array_equal(then, self._mounts[name])
+        }
         for kept, ends, serial in zip(state.kept, state.drawn, state.serials.tolist()):
             if isinstance(kept, KeptRound) or kept.sensor in self._mounts:
+                if isinstance(kept, KeptSweep) and kept.sensor in otherwise:
+                    then_from_now = np.broadcast_to(otherwise[kept.sensor], (2, 3))
+                    kept = replace(kept, in_key=composed_poses(kept.in_key, then_from_now))
+                    ends = composed_poses(ends, then_from_now)
                 self._next_serial = serial
                 self._keep(kept, ends)
         self._next_serial = state.next_serial
@@ -392,8 +408,15 @@ def _may_reach(ends: F64, reach_m: float, places: set[Place], resolution_m: floa
 
 
 def _seen_from(key_pose: Pose2, ends: F64) -> F64:
-    inverse = key_pose.inverse()
-    return composed_poses(np.array([inverse.x_m, inverse.y_m, inverse.yaw_rad]), ends)
+    return composed_poses(_row(key_pose.inverse()), ends)
+
+
+def _inverse_of(pose: F64) -> F64:
+    return _row(Pose2(*pose.tolist()).inverse())[None, :]
+
+
+def _row(pose: Pose2) -> F64:
+    return np.array([pose.x_m, pose.y_m, pose.yaw_rad])
 
 
 def _name(kept: Kept) -> str:

@@ -140,7 +140,17 @@ def _stored_of(rows: Mapping[int, Sequence[bytes]]) -> Stored:
     base = {_PLACE.unpack_from(payload): payload[_PLACE.size :] for payload in rows[_BASE]}
     serials = graph["serials"] if "serials" in graph else np.arange(m)  # nothing was given up once
     next_serial = int(graph["next_serial"]) if "next_serial" in graph else m
-    return Stored(slam, RedrawState(tuple(kept), graph["drawn"], serials, next_serial, base))
+    mounts = _mounts_of(graph, kept, joined["mounts"])
+    return Stored(slam, RedrawState(tuple(kept), graph["drawn"], serials, next_serial, base, mounts))
+
+
+def _mounts_of(graph: Mapping[str, Any], kept: Iterable[Kept], of_keys: F64) -> dict[str, F64]:
+    """Where lasers sat when sweeps were kept. Once it was not told; of a single laser its key scans know."""
+    if "sensors" in graph:
+        return dict(zip(json.loads(graph["sensors"].tobytes()), graph["mounts"]))
+    names = {each.sensor for each in kept if isinstance(each, KeptSweep)}
+    is_one = len(names) == 1 and len(of_keys) > 0 and bool((of_keys == of_keys[0]).all())
+    return dict.fromkeys(names, of_keys[0]) if is_one else {}
 
 
 # --- key scans and graph
@@ -190,6 +200,8 @@ def _graph_tile(stored: Stored) -> bytes:
         drawn=stored.redraw.drawn,
         serials=stored.redraw.serials,
         next_serial=np.array(stored.redraw.next_serial),
+        sensors=np.frombuffer(json.dumps(sorted(stored.redraw.mounts)).encode(), dtype=np.uint8),
+        mounts=np.array([stored.redraw.mounts[name] for name in sorted(stored.redraw.mounts)]).reshape(-1, 3),
     )
 
 

@@ -124,11 +124,7 @@ def calibrate(ticks: WheelTicks, motions: RelativeMotions, start: RobotModel) ->
 
     Motions outside the time of the ticks are not used. With fewer than 20 motions nothing is observable.
     """
-    if len(ticks.stamp_s):
-        begin, end = ticks.stamp_s[0], ticks.stamp_s[-1]
-        offset = start.time_offset_s
-        within = (motions.start_s + offset >= begin - 0.01) & (motions.end_s + offset <= end + 0.01)
-        motions = _only(motions, within)
+    motions = _within(ticks, motions, start.time_offset_s)
     if len(motions) < LEAST_MOTIONS or len(ticks.stamp_s) < 2:
         return _nothing(start, len(motions))
     problem = _Problem(ticks, motions, start)
@@ -300,9 +296,7 @@ def _closed_form(ticks: WheelTicks, motions: RelativeMotions, start: RobotModel)
     None if the drive does not tell both wheels' share of the turns, or signs differ from those of the start.
     """
     shift = start.time_offset_s
-    counted = np.stack((ticks.left, ticks.right), axis=-1)
-    rolled = _at(ticks.stamp_s, counted, motions.end_s + shift) - _at(ticks.stamp_s, counted, motions.start_s + shift)
-    turns = _fitted(rolled, motions.motion[:, 2])
+    turns = _fitted(_rolled(ticks, motions, shift), motions.motion[:, 2])
     if turns is None or turns[0] * start.left_m_per_tick >= 0.0 or turns[1] * start.right_m_per_tick <= 0.0:
         return None
     per_track = np.array([-turns[0], turns[1], 1.0, 0.0, 0.0, 0.0, shift])  # the base's way in units of the track
@@ -331,6 +325,28 @@ def _closed_form(ticks: WheelTicks, motions: RelativeMotions, start: RobotModel)
     return RobotModel(-turns[0] * track, turns[1] * track, float(track), float(x), float(y), yaw, shift)
 
 
+def turns_as_believed(ticks: WheelTicks, motions: RelativeMotions, start: RobotModel) -> tuple[bool, bool] | None:
+    """Whether the laser turns as the counts of the left and of the right wheel let expect; None if that is not clear.
+
+    Both wrong: the laser hangs head down (or does not), the wheels are exchanged, or both count backwards. One wrong:
+    that wheel counts backwards. Such signs are settings that no fit can put right.
+    """
+    motions = _within(ticks, motions, start.time_offset_s)
+    if len(motions) < LEAST_MOTIONS or len(ticks.stamp_s) < 2:
+        return None
+    turns = _fitted(_rolled(ticks, motions, start.time_offset_s), motions.motion[:, 2])
+    if turns is None:
+        return None
+    return turns[0] * start.left_m_per_tick < 0.0, turns[1] * start.right_m_per_tick > 0.0
+
+
+def _rolled(ticks: WheelTicks, motions: RelativeMotions, shift_s: float) -> F64:
+    """(K, 2) counts of both wheels during each motion."""
+    counted = np.stack((ticks.left, ticks.right), axis=-1)
+    ends, starts = motions.end_s + shift_s, motions.start_s + shift_s
+    return _at(ticks.stamp_s, counted, ends) - _at(ticks.stamp_s, counted, starts)
+
+
 def _at(stamp_s: F64, values: F64, at_s: F64) -> F64:
     return np.stack([np.interp(at_s, stamp_s, column) for column in values.T], axis=-1)
 
@@ -350,6 +366,14 @@ def _fitted(rolled: F64, turn: F64) -> tuple[float, float] | None:
     if np.any(np.abs(gains) < LEAST_TURN_SIGNIFICANCE * deviation):
         return None
     return float(gains[0]), float(gains[1])
+
+
+def _within(ticks: WheelTicks, motions: RelativeMotions, offset_s: float) -> RelativeMotions:
+    """Motions during the time of the ticks."""
+    if not len(ticks.stamp_s):
+        return motions
+    begin, end = ticks.stamp_s[0], ticks.stamp_s[-1]
+    return _only(motions, (motions.start_s + offset_s >= begin - 0.01) & (motions.end_s + offset_s <= end + 0.01))
 
 
 def _only(motions: RelativeMotions, chosen: Bools) -> RelativeMotions:

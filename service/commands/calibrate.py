@@ -91,6 +91,8 @@ def _ask_daemon(connect: str | None, config: Path | None, robot: str | None, *, 
     for laser, report in document["lasers"].items():
         typer.secho(f"by {laser}", bold=True)
         _print(report)
+        if (wrong := report.get("contradiction")) is not None:
+            typer.echo(f"{'look at':<22} {wrong}")
         for each in report["advice"]:
             typer.echo(
                 f"{'look at':<22} {each['setting']} = {each['value']} ± {each['deviation']}, not {each['instead_of']}"

@@ -109,11 +109,12 @@ def advice_text(calibration: Mapping[str, Any]) -> str:
     """What the drive so far contradicts of the configuration; empty if nothing. Of several lasers the first to say."""
     found: dict[str, str] = {}
     for report in calibration["lasers"].values():
+        if (wrong := report.get("contradiction")) is not None:
+            found.setdefault(wrong, wrong)
         for each in report["advice"]:
-            found.setdefault(each["setting"], f"{each['value']} ± {each['deviation']}, not {each['instead_of']}")
-    if not found:
-        return ""
-    return "to look at: " + "; ".join(f"{setting} = {text}" for setting, text in found.items()) + " (umfeld calibrate)"
+            text = f"{each['setting']} = {each['value']} ± {each['deviation']}, not {each['instead_of']}"
+            found.setdefault(each["setting"], text)
+    return "to look at: " + "; ".join(found.values()) + " (umfeld calibrate)" if found else ""
 
 
 def _row(source: Mapping[str, Any]) -> tuple[str, str, str, str, str, str, str]:

@@ -8,6 +8,7 @@ import os
 import signal
 from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -32,7 +33,10 @@ _DRAIN = 64
 def view(
     *,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: a free one.")] = DEFAULT_PORT,
-    connect: Annotated[str, typer.Option(help="Where the daemon listens.")] = "tcp/127.0.0.1:7447",
+    connect: Annotated[
+        str | None, typer.Option(help="The daemon's endpoint; default: that of the configuration.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="The daemon's configuration file.")] = None,
     base: Annotated[str, typer.Option(help="Key of the robots to show; * stands for any.")] = "robots/*",
     allow_host: Annotated[
         list[str] | None, typer.Option(help="Another name for this page, e.g. of a reverse proxy before it.")
@@ -42,9 +46,10 @@ def view(
 
     Example: umfeld view --port 8765, and from a desk: ssh -L 8765:127.0.0.1:8765 robot
     """
+    from service.config_files import daemon_endpoint, find_config
     from service.zenoh_session import Client
 
-    with Client(connect) as client:
+    with Client(connect or daemon_endpoint(find_config(config))) as client:
         try:
             asyncio.run(_serve(client, base, port, allow_host or []))
         except OSError as error:

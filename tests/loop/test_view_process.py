@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -25,10 +26,12 @@ def router() -> Iterator[tuple[str, zenoh.Session]]:
 
 @pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("daemon_gone", [False, True])
-def test_the_page_ends_quietly(told: signal.Signals, daemon_gone: bool) -> None:
+def test_the_page_ends_quietly(told: signal.Signals, daemon_gone: bool, tmp_path: Path) -> None:
     with router() as (endpoint, session):
+        config = tmp_path / "umfeld.toml"
+        config.write_text(f'[network]\nlisten = ["{endpoint}"]\n')  # where the daemon is, as for all commands
         view = subprocess.Popen(
-            [sys.executable, "-m", "service", "view", "--port", "0", "--connect", endpoint],
+            [sys.executable, "-m", "service", "view", "--port", "0", "--config", str(config)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

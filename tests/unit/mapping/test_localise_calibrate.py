@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2, exp_se2
-from mapping.localise.calibrate import NAMES, Calibration, RobotModel, WheelTicks, calibrate
+from mapping.localise.calibrate import NAMES, Calibration, RobotModel, WheelTicks, calibrate, turns_as_believed
 from mapping.localise.relative_motions import RelativeMotions, spread_out
 from mapping.localise.umbmark import square_end, umbmark
 
@@ -219,3 +219,22 @@ def test_a_right_robot_comes_home_and_the_worse_way_round_counts() -> None:
     assert found.clockwise.tolist() == pytest.approx([0.2, 0.0])
     with pytest.raises(ValueError, match="both"):
         umbmark(np.zeros((0, 2)), np.zeros((1, 2)), track_width_m=0.5)
+
+
+def test_signs_that_no_fit_puts_right_are_found() -> None:
+    ticks, motions = drive(about(), noise_m=0.003, noise_rad=0.003)
+    assert turns_as_believed(ticks, motions, START) == (True, True)
+    mirrored = replace(motions, motion=motions.motion * [1.0, -1.0, -1.0])  # a laser that hangs head down
+    assert turns_as_believed(ticks, mirrored, START) == (False, False)
+    exchanged = WheelTicks(ticks.stamp_s, -ticks.right, -ticks.left)  # each with the other's sign
+    assert turns_as_believed(exchanged, motions, START) == (False, False)
+    assert turns_as_believed(WheelTicks(ticks.stamp_s, -ticks.left, ticks.right), motions, START) == (False, True)
+    assert turns_as_believed(WheelTicks(ticks.stamp_s, ticks.left, -ticks.right), motions, START) == (True, False)
+
+
+def test_signs_are_not_told_of_a_drive_that_does_not_show_them() -> None:
+    straight = np.stack((np.full(40, 0.8), np.zeros(40)), axis=-1)
+    assert turns_as_believed(*drive(straight, noise_m=0.003, noise_rad=0.003), START) is None
+    ticks, motions = drive(about(3))
+    assert turns_as_believed(ticks, motions, START) is None
+    assert turns_as_believed(WheelTicks(np.zeros(0), np.zeros(0), np.zeros(0)), drive(about())[1], START) is None

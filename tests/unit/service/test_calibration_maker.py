@@ -210,6 +210,9 @@ def test_only_what_is_surely_and_clearly_off_is_advised() -> None:
     gain = DRIVE.right_m_per_tick * 0.02  # its ticks fall rolling forward: a radius is positive all the same
     assert advised(told({"right_m_per_tick": gain})) == {"drive.wheel_radius_right_m": 0.102}
     assert advised(told({"laser_yaw_rad": 0.02, "time_offset_s": 0.5})) == {"lasers.front.mount.yaw_deg": 1.15}
+    turn = 2.0 * math.pi  # a laser that looks back: 180 degrees are -180
+    assert advised(told({"laser_yaw_rad": turn})) == {}
+    assert advised(told({"laser_yaw_rad": 0.02 - turn})) == {"lasers.front.mount.yaw_deg": 1.15}
 
 
 def test_a_new_finding_is_one_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
@@ -221,6 +224,31 @@ def test_a_new_finding_is_one_line_in_the_log(caplog: pytest.LogCaptureFixture) 
     assert [record.message for record in caplog.records] == [
         "calibration by front: the drive so far says drive.track_width_m = 0.42 ± 0.0004 instead of 0.4"
     ]
+
+
+@pytest.mark.parametrize(
+    ("as_believed", "words"),
+    [
+        ((False, False), "lasers.front.mount.upside_down wrong"),
+        ((False, True), "the left wheel counts backwards: drive.ticks_per_turn_left = -2000"),
+        ((True, False), "the right wheel counts backwards: drive.ticks_per_turn_right = 2000"),
+    ],
+)
+def test_a_sign_that_is_wrong_is_told_once_and_no_number_with_it(
+    as_believed: tuple[bool, bool], words: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = maker()
+    made._lasers["front"].found = told({"track_width_m": 0.02})[0]
+    made._lasers["front"].turns_as_believed = as_believed
+    with caplog.at_level(logging.INFO):
+        fields = made._fields()
+        assert made._fields() == fields
+    (record,) = caplog.records
+    assert words in record.message
+    (report,) = fields["lasers"].values()  # type: ignore[attr-defined]
+    assert words in report["contradiction"]
+    assert report["advice"] == []
+    assert words in advice_text(fields)
 
 
 def test_status_says_each_setting_once() -> None:

@@ -29,7 +29,7 @@ from service.locks import Claims
 from service.outputs import GridOut, GridUpdateOut, HealthOut, Output, ScanOut
 from service.rpc import CallRefused
 from service.sensors import Laser
-from service.store import MapStore, occupancy_patch
+from service.store import MapStore, StoreNotWritten, occupancy_patch
 from service.systemd import Notifier
 from service.worker import Worker
 from tests.waiting import GIVE_UP_S, free_port
@@ -322,6 +322,22 @@ def test_a_snapshot_writes_only_what_changed(store: MapStore) -> None:
     draw(layer, 50.0)
     assert keeper.snapshot()
     assert 0 < keeper.counters()["store_tiles"] - before <= 2 * 4
+
+
+def test_a_last_snapshot_that_the_disk_refuses_is_told(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    layer = building()
+    keeper = live(layer, store)
+    draw(layer, 0.0)
+
+    def refuse(*_: object, **__: object) -> int:
+        raise StoreNotWritten("m.umfeld: not saved: database or disk is full; free some space")
+
+    with monkeypatch.context() as full:
+        full.setattr(MapStore, "snapshot", refuse)
+        with pytest.raises(Trouble, match="free some space"):
+            keeper.finish()
+    keeper.finish()  # there is room again: nothing was lost meanwhile
+    assert store.load_tiles(GRID)
 
 
 def test_a_map_of_another_resolution_is_refused_with_the_setting_to_change(store: MapStore) -> None:

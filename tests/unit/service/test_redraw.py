@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -23,7 +24,7 @@ from service.fusion import Cone, Round, Touch
 from service.layers import BuildingLayer, RollingLayer, insert_sweep
 from service.redraw import DELAY_NS, DELAY_NS_PER_KEPT, KeptRound, Redrawer
 from service.sensors import Switch
-from service.slam_store import _kept_of, _kept_tile, _unpack
+from service.slam_store import _kept_of, _kept_tile, _mounts_of, _unpack
 from tests.waiting import GIVE_UP_S
 
 F64 = NDArray[np.float64]
@@ -201,6 +202,41 @@ def test_what_was_touched_moves_too_and_is_stored() -> None:
     (again,) = _kept_of(_unpack(_kept_tile([kept])))
     assert isinstance(again, KeptRound)
     assert (again.sensor, again.key, again.heard) == (kept.sensor, kept.key, kept.heard)
+
+
+@pytest.mark.parametrize("told", [True, False])  # stores of before do not tell where the laser sat; their keys do
+def test_a_mount_that_is_put_right_moves_nothing_that_was_seen(told: bool) -> None:
+    layer = building()
+    redrawer = redrawer_of(layer)
+    draw_and_keep(redrawer, layer, 0, 0.5)
+    draw_and_keep(redrawer, layer, FAR_KEY, 0.0)
+    state = redrawer.state()
+    assert list(state.mounts) == ["front"]
+    if not told:
+        mounts = np.broadcast_to(state.mounts["front"], (2, 3))
+        state = replace(state, mounts=_mounts_of({}, state.kept, mounts))
+
+    right = Pose2(0.12, -0.04, 0.3 - math.radians(5.0))
+    later = Redrawer([layer], layer, {"front": right}, submit=at_once)
+    later.resume(state)
+    for before, after in zip(redrawer.sweeps(), later.sweeps()):
+        np.testing.assert_allclose(after()[2], before()[2], atol=1e-9)
+    later.corrected(0, KEYS)
+    assert not later.is_due(1 << 60)  # nothing has moved
+    later.corrected(0, moved_keys(1.0))
+    later.take_up(1 << 60, moved_keys(1.0))
+    np.testing.assert_array_equal(
+        layer.grid.patch().cells, drawn_afresh(moved_keys(1.0), [(0, 0.5), (FAR_KEY, 0.0)]).patch().cells
+    )
+    np.testing.assert_array_equal(later.state().mounts["front"], [right.x_m, right.y_m, right.yaw_rad])
+
+
+def test_where_lasers_sat_is_not_guessed_of_several() -> None:
+    redrawer = redrawer_of(layer := building())
+    draw_and_keep(redrawer, layer, 0, 0.5)
+    kept = redrawer.state().kept
+    assert _mounts_of({}, kept, np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]])) == {}
+    assert _mounts_of({}, kept, np.zeros((0, 3))) == {}
 
 
 def test_a_job_that_fails_leaves_the_map_and_is_counted(caplog: pytest.LogCaptureFixture) -> None:
