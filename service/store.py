@@ -107,15 +107,23 @@ class MapStore:
             if not path.is_file():
                 raise StoreTrouble(f"{path}: there is no such map; `umfeld map list` names those there are")
             return cls(path, _connect(path, read_only=True), None, wall_ns, restored="")
+        if path.is_dir():
+            raise StoreTrouble(f"{path}: is a folder; set [store] path to a file in it, e.g. {path / f'map{SUFFIX}'}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = _take_lock(path)
         except OSError as error:
-            raise StoreTrouble(f"{path}: {error.strerror}; allow writing there or set [store] path") from error
+            raise StoreTrouble(
+                f"{error.filename or path}: {error.strerror}; allow writing there or set [store] path"
+            ) from error
         try:
             restored = _repair(path)
             connection = _connect(path, read_only=False)
             _migrate(connection, path)
+        except OSError as error:  # another user's, for instance root's
+            os.close(lock)
+            owner = "give it to the user of the daemon (`chown`), or set another [store] path"
+            raise StoreTrouble(f"{error.filename or path}: {error.strerror}; {owner}") from error
         except BaseException:
             os.close(lock)
             raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import resource
 import sqlite3
@@ -292,6 +293,27 @@ def test_a_full_disk_loses_nothing_and_is_tried_again(path: Path) -> None:
         assert store.load_tiles("a")[0] == (0, 0, b"newest")
         assert store.get_meta("note") == 1
     assert check_file(path) is None
+
+
+def test_a_folder_is_no_map(tmp_path: Path) -> None:
+    with pytest.raises(StoreTrouble, match=r"is a folder; set \[store\] path to a file in it, e.g. .*/map.umfeld"):
+        open_map(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_map_of_another_user_is_told_with_its_repair(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_map(path) as store:
+        store.save_tiles("a", [(0, 0, b"x")])
+
+    def refused(file: Path) -> str:
+        raise PermissionError(errno.EACCES, "Permission denied", str(file))
+
+    with monkeypatch.context() as others:
+        others.setattr(store_module, "_repair", refused)
+        with pytest.raises(StoreTrouble, match=r"Permission denied; give it to the user of the daemon \(`chown`\)"):
+            open_map(path)
+    with open_map(path) as store:  # the lock was let go
+        assert store.load_tiles("a") == [(0, 0, b"x")]
 
 
 def test_a_full_disk_keeps_the_old_copy(path: Path, tmp_path: Path) -> None:
