@@ -46,7 +46,8 @@ class Direction(StrEnum):
     OUT = "out"  # item: what was sent, or SetBaudRate, at the time given to requests()
     CONNECTED = "connected"  # item: name of the source whose conversation was (re)started
     LOST = "lost"  # item: why the wire was given up
-    TURN = "turn"  # item: "": every conversation's requests() is called with this time, before what is then sent
+    TURN = "turn"  # requests() is called with this time, before what is then sent; item: "": of every conversation,
+    # else the names of those of which it is, one a line
 
 
 Tap = Callable[[Direction, int, "bytes | CanFrame | SetBaudRate | str"], None]

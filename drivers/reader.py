@@ -17,7 +17,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic
 
@@ -213,9 +213,8 @@ class WireReader(Generic[WireT]):
                     heard_out_ns = now_ns
                     self._hand_on(port.read(0.0))
                     now_ns = max(self._clock(), now_ns)
-                if self._tap is not None:
-                    self._tap(Direction.TURN, now_ns, "")
                 due = [source for source in self._sources if source.is_due(now_ns)]
+                self._tap_turn(now_ns, due)
                 for source in due:
                     self._send(port, source.requests(now_ns), now_ns)
                 self._send_posted(port)
@@ -292,8 +291,7 @@ class WireReader(Generic[WireT]):
 
     def _note_said(self, port: Port[WireT], said: _Said[WireT]) -> None:
         """Let the source know that it has spoken; whatever else it had to say then is sent now."""
-        if self._tap is not None:
-            self._tap(Direction.TURN, said.sent_ns, "")
+        self._tap_turn(said.sent_ns, [said.source])
         to_come = True
         for item in said.source.requests(said.sent_ns):
             if to_come and item == said.item:
@@ -303,6 +301,12 @@ class WireReader(Generic[WireT]):
             else:
                 self._send(port, (item,), said.sent_ns)
         said.source.plan(said.sent_ns)
+
+    def _tap_turn(self, now_ns: int, asked: Sequence[_Source[WireT]]) -> None:
+        """Let the recording know who is asked now: all, or those whose names it is told."""
+        if self._tap is not None and asked:
+            names = "" if len(asked) == len(self._sources) else "\n".join(source.name for source in asked)
+            self._tap(Direction.TURN, now_ns, names)
 
     def _is_amid(self) -> bool:
         """Whether the rest of a message is on its way, and no conversation has anything to ask before that."""

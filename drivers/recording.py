@@ -8,7 +8,8 @@ CDR message of the type in WIRE_TYPE, one channel a wire, so that any reader of 
     0       int64     stamp_ns      host monotonic: arrival of what came in, the requests() call behind what went out
     8       uint32    number        CAN id, or bits a second
     12      int64[]   asked_ns      requests() was called then, in this order, before this item
-    ..      uint8     direction     0 in, 1 out, 2 conversation begun, 3 wire lost, 4 nothing but asked_ns
+    ..      uint8     direction     0 in, 1 out, 2 conversation begun, 3 wire lost, 4 nothing but asked_ns; with words:
+                                    at stamp_ns only the sources named there, one a line, were asked
     ..      uint8     form          0 bytes, 1 CAN frame, 2 line speed, 3 words
     ..      uint8     flags         of a CAN frame: 1 extended, 2 remote
     ..      uint8     dlc           length that a remote frame asks for, 255 if not said
@@ -132,7 +133,7 @@ class WireWriter:
 
     def take(self, direction: Direction, stamp_ns: int, item: Item) -> WireRecord | None:
         """What a tap heard; returns what is to be kept now, in this order, None if that can wait."""
-        if direction is Direction.TURN:
+        if direction is Direction.TURN and not item:
             self._asked_ns.append(stamp_ns)
             return self.rest() if len(self._asked_ns) >= self.longest_wait else None
         return WireRecord(stamp_ns, direction, item, self._taken())
@@ -178,15 +179,17 @@ class WirePlayer:
                 self._compare(record.item)
             case Direction.CONNECTED:
                 self._begin(str(record.item), record.stamp_ns)
+            case Direction.TURN if record.item:
+                self._ask(record.stamp_ns, only=frozenset(str(record.item).split("\n")))
             case _:
                 pass
 
-    def _ask(self, now_ns: int) -> None:
+    def _ask(self, now_ns: int, *, only: frozenset[str] | None = None) -> None:
         self.sent_otherwise += len(self._expected) + self._surplus
         self._expected.clear()
         self._surplus = 0
         for source, conversation in self._conversations.items():
-            if source not in self._broken:
+            if source not in self._broken and (only is None or source in only):
                 try:
                     self._expected.extend(conversation.requests(now_ns))
                 except Exception as error:

@@ -381,6 +381,29 @@ def test_what_is_prepared_leaves_on_time_once_and_is_asked_for_before_its_answer
     assert order == [(Direction.TURN, 200), (Direction.OUT, 200), (Direction.IN, 202), (Direction.TURN, 202)]
 
 
+def test_a_recording_is_told_who_of_a_shared_wire_was_asked() -> None:
+    heard: list[tuple[Direction, int, object]] = []
+    bench = Bench()
+    talkers = {"left": Telling(), "right": Telling()}
+    bench.reader = WireReader(
+        "bench", bench.open, talkers, bench.sink, clock=lambda: bench.now_ns, wait=bench.wait,
+        tap=lambda *event: heard.append(event),
+    )  # fmt: skip
+    for ms in range(5, 500, 20):
+        bench.plan.append((ms * MS, lambda: bench.say(b"!")))
+    for ms, name in ((204, "left"), (304, "right"), (404, "left")):  # so that the next turn knows
+        bench.plan.append((ms * MS, partial(setattr, talkers[name], "due_ns", (ms + 9) * MS)))
+    bench.plan.sort(key=lambda each: each[0])
+    bench.run_until(500)
+    asked: dict[str, list[int]] = {name: [] for name in talkers}
+    for direction, at_ns, item in heard:
+        if direction is Direction.TURN:
+            for name in str(item).split("\n") if item else talkers:
+                asked[name].append(at_ns)
+    assert asked == {name: talker.requested_at for name, talker in talkers.items()}
+    assert {item for direction, _, item in heard if direction is Direction.TURN} == {"", "left", "right"}
+
+
 def test_what_is_not_for_a_conversation_is_not_given_to_it_and_needs_no_turn_of_it() -> None:
     class Choosy(Telling):
         def __init__(self, mark: bytes) -> None:

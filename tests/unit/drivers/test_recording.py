@@ -175,3 +175,34 @@ def test_a_wire_that_only_turns_is_written_now_and_then() -> None:
     longest = max(len(record.asked_ns) for record in records)
     assert longest <= 50
     assert sum(len(record.asked_ns) for record in records) == 1000
+
+
+@given(st.lists(st.lists(st.sampled_from(["left", "right"]), min_size=1, max_size=2, unique=True), max_size=60))
+def test_of_a_shared_wire_those_are_asked_again_who_were_asked(turns: list[list[str]]) -> None:
+    """A turn concerns whom it must; a driver that is asked more often than it was says something else."""
+    talkers, writer = {"left": Sums(), "right": Sums()}, WireWriter()
+    records: list[WireRecord] = []
+
+    def tap(direction: Direction, stamp_ns: int, item: Item) -> None:
+        if (record := writer.take(direction, stamp_ns, item)) is not None:
+            records.append(decode_record(encode_record(record)))
+
+    for name, talker in talkers.items():
+        tap(Direction.CONNECTED, 0, name)
+        talker.connected(0)
+    sent = 0
+    for now_ns, asked in enumerate(turns, start=1):
+        names = [name for name in talkers if name in asked]
+        tap(Direction.TURN, now_ns, "" if len(names) == len(talkers) else "\n".join(names))
+        for name in names:
+            for item in talkers[name].requests(now_ns):
+                tap(Direction.OUT, now_ns, item)
+                sent += 1
+    if (rest := writer.rest()) is not None:
+        records.append(rest)
+    again = {"left": Sums(), "right": Sums()}
+    player = WirePlayer(again)
+    for record in records:
+        list(player.play(record))
+    assert (player.sent, player.sent_otherwise) == (sent, 0)
+    assert [each.sum for each in again.values()] == [each.sum for each in talkers.values()]
