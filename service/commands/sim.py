@@ -30,7 +30,7 @@ def sim(
     speed: Annotated[float | None, typer.Option(help="Times real time, of robot and world or log.")] = None,
     laser: Annotated[
         str | None,
-        typer.Option(help="Model of the lasers: utm-30lx (default), lms200, rplidar-a1, ld06, tim571, ..."),
+        typer.Option(help="Model of the lasers: utm-30lx, lms200, rplidar-a1, ld06, tim571, ...; default: by driver."),
     ] = None,
     fault: Annotated[
         list[str] | None,

@@ -16,6 +16,18 @@ DEVICES = sorted(path.stem for path in PAGES.glob("*.md") if path.stem not in NO
 
 
 @pytest.mark.parametrize("name", DEVICES)
+def test_the_settings_of_a_page_are_keys_of_the_configuration(name: str) -> None:
+    known = set(re.findall(r"^\| `([a-z0-9_]+)` \|", (PAGES.parent / "configuration.md").read_text(), re.M))
+    rows: list[str] = []
+    for table in re.findall(
+        r"^\| (?:key|setting) \|.*\n\| ---.*\n((?:\|.*\n)+)", (PAGES / f"{name}.md").read_text(), re.M
+    ):
+        rows += [row.split("|")[1] for row in table.splitlines()]
+    told = {key for row in rows for key in re.findall(r"`(?:\[\w+\] )?([a-z0-9_]+)`", row)}
+    assert told - known == set()
+
+
+@pytest.mark.parametrize("name", DEVICES)
 def test_the_tables_of_a_page_run_on_the_emulated_device(name: str) -> None:
     text = (PAGES / f"{name}.md").read_text()
     table = tomllib.loads(re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S)[0])
