@@ -48,6 +48,7 @@ OCCUPIED_FROM_PERCENT = 65  # as map servers read a map: occupied_thresh 0.65
 NEAR_M = 0.10
 BEFORE_END_M = 0.20
 LIGHTER_AT = (4, 40, 160)  # calls of progress: when kernels of the first scans are loaded, of closures, of all
+LIGHTER_EVERY = 80
 TRIMMED_EVERY = 20  # calls of progress
 APART_M, APART_RAD = 0.2, math.radians(10.0)  # of scans that add lines: more of them add little
 
@@ -156,7 +157,7 @@ class _Lighter:
 
     def __call__(self, done: int, total: int) -> None:
         self._calls += 1
-        if self._calls in LIGHTER_AT:
+        if self._calls in LIGHTER_AT or self._calls % LIGHTER_EVERY == 0:
             give_back_code()
         if self._calls % TRIMMED_EVERY == 0:
             give_back_heap()  # what optimising the graph took
