@@ -38,6 +38,7 @@ _SILENCE_PATIENCE_NS = 400_000_000  # a device that only paused keeps its set-up
 _SHORTEST_BEFORE_RESET_NS = 600_000_000
 _SILENCE_OF_STRANGERS_NS = 200_000_000  # until a source's usual period is known
 _MUCH_LONGER = 1.5  # less is the jitter of its deliveries
+_SETTLING_NS = 100_000_000  # waits that begin so soon after it runs again are the device's, and teach nothing
 _CHECK_PERIOD_NS = 50_000_000  # words are looked at so often; a change of state, and silence, at once
 _HELD_UP_NS = 5_000_000  # a turn that took so much longer than it should was held up: by the system, or other threads
 _SETUP_LIMIT_NS = 20_000_000_000  # spin-up and the search for a line speed included
@@ -429,6 +430,7 @@ class _Source(Generic[WireT]):
         self._restarts = 0
         self._bugs = 0
         self._last_reading_ns: int | None = None
+        self._resumed_ns = 0  # the first reading after a start, or a silence that was told
         self._rate = Rate()
         self._usual = UsualPeriod()
         self._hold_ups = HoldUps()
@@ -633,8 +635,10 @@ class _Source(Generic[WireT]):
 
     def _note_reading(self, stamp_ns: int) -> None:
         self._readings += 1
-        if self._last_reading_ns is not None:
+        if self._last_reading_ns is not None and self._alive_ns - self._resumed_ns >= _SETTLING_NS:
             self._hold_ups.count(stamp_ns, stamp_ns - self._alive_ns)
+        if self._loop_trouble is not None or self._seen_state is not LinkState.RUNNING:
+            self._resumed_ns = stamp_ns
         self._note_life(stamp_ns)
         self._last_reading_ns = stamp_ns
         self._loop_trouble = None

@@ -534,6 +534,19 @@ def test_a_hundred_readings_a_second_are_missed_after_three_periods() -> None:
     assert told_ms - 2_990 in (30, 31)
 
 
+def test_a_wait_right_after_a_silence_buys_no_time_for_the_next_one() -> None:
+    """A device that needs 28 ms for its second reading, once it is back, is missed after three periods all the same."""
+    bench = Bench()
+    bench.talker.silence_limit_ns = silence_limit(10 * MS)
+    bench.say_from_to(50, 3_000, 10)
+    bench.plan.append((3_400 * MS, bench.say))
+    bench.say_from_to(3_428, 5_000, 10)
+    bench.run_until(5_200)
+    told_ms, state, _ = bench.events()[-1]
+    assert state is LinkState.SILENT
+    assert told_ms - 4_998 in (30, 31)
+
+
 def test_readings_that_are_held_back_get_more_time_and_it_is_taken_back_later() -> None:
     """A hub that delivers every 34 ms for a while: told once at most, until 20 s after the last of them."""
     bench = Bench()
