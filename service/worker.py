@@ -12,7 +12,7 @@ from functools import partial
 from typing import TypeVar
 
 from drivers.queues import BoundedQueue
-from drivers.readings import DeviceEvent, PoseReading, Reading, WheelReading
+from drivers.readings import DeviceEvent, PoseReading, Reading, ScanReading, WheelReading
 from service.errors import Trouble
 from service.fusion import POSE_PERIOD_NS, SECOND, TICK_PERIOD_NS, Fusion
 from service.outputs import HealthOut, Output
@@ -70,6 +70,7 @@ class Worker:
         self._offer = offer
         self._offered = offered
         self._odometry_is_read = odometry_is_read
+        self._sweep_waits = False  # for the next motion, to be drawn
         self._woken_ns: dict[str, int] = {}  # by source of motion: stamp of the last that this thread was woken for
         self._now_ns = now_ns
         self._beat = beat
@@ -102,9 +103,13 @@ class Worker:
         """Whether the fusion thread, which a tick wakes at the latest, need not be woken for this.
 
         A hundred motions a second are wanted where odometry is read. Elsewhere they are for the poses of the robot,
-        which are told every 25 ms, and of scans, which come by themselves.
+        which are told every 25 ms, and of scans: the first one behind a scan is taken at once, so that the scan is
+        drawn long before the next one comes.
         """
         if not isinstance(item, WheelReading | PoseReading) or self._odometry_is_read():
+            return False
+        if self._sweep_waits:
+            self._sweep_waits = False
             return False
         woken_ns = self._woken_ns.get(source)
         if woken_ns is not None and 0 <= item.stamp_ns - woken_ns < POSE_PERIOD_NS:
@@ -147,6 +152,8 @@ class Worker:
                 item.run()
                 continue
             self._take(source, item)
+            if isinstance(item, ScanReading):
+                self._sweep_waits = True
             if isinstance(item, DeviceEvent):
                 self._next_health_ns = min(self._next_health_ns, self._health_told_ns + _HEALTH_GAP_NS)
         now_ns = self._now_ns()

@@ -126,6 +126,15 @@ def test_motions_wake_fusion_where_they_are_read_and_otherwise_as_often_as_poses
     worker.sink("front", scan(60_000_000))
     worker.sink("drive", DeviceEvent(70_000_000, LinkState.ABSENT, "gone"))
     assert woken == [60, 70], "everything else is taken at once"
+    monkeypatch.undo()
+    office.clock.turn(SECOND)
+    worker.sink("front", scan(office.clock.now_ns()))
+    worker.turn(0.0)
+    monkeypatch.setattr(worker._queue, "put", put)
+    woken.clear()
+    for ms in range(1000, 1050, 10):
+        worker.sink("drive", WheelReading(ms * 1_000_000, 0, 0, True))
+    assert woken == [1000, 1010, 1040], "the first behind a scan, beside those of the poses"
 
 
 def test_a_bug_costs_one_reading_not_the_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
