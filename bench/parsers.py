@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.fault_ledger import DEVICES
 from bench.fault_rig import SECOND, Rig
@@ -26,9 +27,14 @@ from drivers.readings import SourceCounters
 from drivers.slcan_bus import decode_line as slcan_line
 from drivers.sonar_maxbotix import MaxBotixConversation
 from drivers.sonar_usboard import UsBoardSerialConversation
+from sim_devices.device import Mount
+from sim_devices.encoder_roboclaw import RoboClaw
+from sim_devices.wheel import Wheel
 
 LEAST_PER_S, MOST_S = 5000.0, 0.050
+MS = 1_000_000
 CHUNK = 4096  # what a serial line has ready at once
+F64 = NDArray[np.float64]
 Feed = Callable[[bytes], Iterable[object]]
 
 
@@ -47,7 +53,7 @@ def by_lines(decode: Callable[[bytes], object], end: bytes) -> Callable[[], Feed
     return lambda: feed
 
 
-# A device of the ledger -> its parser.  RoboClaw answers are only told apart by their question: noise alone is tried.
+# A device of the ledger -> its parser.  RoboClaw answers are only told apart by their question: see measure_asked.
 PARSERS: dict[str, Callable[[], Feed]] = {
     "Hokuyo UTM-30LX": lambda: _with_stamp(scip.ScipReplies().feed),
     "SICK LMS200": lambda: _with_stamp(sick_telegrams.TelegramReader().feed),
@@ -114,6 +120,36 @@ def measure(name: str, data: bytes) -> Figures:
     return Figures(name, frames, frames / best_s, slowest_s)
 
 
+def measure_asked(rounds: int = 20_000) -> Figures:
+    """RoboClaw: answers mean something only after their question: an emulated board is asked. Only reading counts."""
+    still = _Still()
+    board = RoboClaw(Wheel(still, "left", 0.1, 1000.0), Wheel(still, "right", 0.1, 1000.0))
+    conversation = RoboClawConversation(rate_hz=200.0)
+    conversation.connected(0)
+    frames, took_s = 0, 0.0
+    for now_ns in range(0, rounds * MS, MS):
+        asked = b"".join(item for item in conversation.requests(now_ns) if isinstance(item, bytes))
+        answer = board.step(now_ns, asked, None)
+        if answer:
+            frames += 1
+            took_s += _took(lambda: list(conversation.receive(answer, now_ns)))  # noqa: B023
+    noise = measure("RoboClaw", b"")
+    return Figures("RoboClaw", frames, frames / took_s, noise.slowest_s)
+
+
+class _Still:
+    """A robot that stands and sees nothing (a sim_devices.device.Scene)."""
+
+    def beam_ranges(self, mount: Mount, bearing_rad: F64, stamp_ns: F64, range_max_m: float) -> F64:
+        return np.full(len(bearing_rad), np.nan)
+
+    def cone_range(self, mount: Mount, half_angle_rad: float, now_ns: int, range_max_m: float) -> float:
+        return float("nan")
+
+    def wheel_travel_m(self, now_ns: int) -> tuple[float, float]:
+        return 0.0, 0.0
+
+
 def bad_bytes(data: bytes) -> list[bytes]:
     """Noise, damaged frames, and what looks like the begin of frames without end."""
     rng = np.random.default_rng(5)
@@ -131,7 +167,7 @@ def _took(work: Callable[[], object]) -> float:
 
 def main() -> int:
     """Print the table."""
-    rows = [measure(name, sent_by(name)) for name in PARSERS]
+    rows = [measure_asked() if name == "RoboClaw" else measure(name, sent_by(name)) for name in PARSERS]
     print(f"{'parser':28} {'frames':>7} {'frames/s':>9} {'slowest 4 kB':>13}")
     for row in rows:
         rate = f"{row.per_s:9,.0f}" if row.frames else "        -"

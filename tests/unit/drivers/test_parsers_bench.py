@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.parsers import PARSERS, Figures, bad_bytes, sent_by
+from bench.parsers import PARSERS, Figures, bad_bytes, measure_asked, sent_by
 
 
 @pytest.mark.parametrize("name", [name for name in PARSERS if name != "RoboClaw"])
@@ -15,6 +15,10 @@ def test_the_bytes_of_an_emulated_device_hold_frames_and_damage_none_more(name: 
     noise, damaged, *_ = bad_bytes(data)
     assert len(noise) > 4096
     assert len(list(PARSERS[name]()(damaged))) <= whole
+
+
+def test_a_roboclaw_is_asked() -> None:
+    assert measure_asked(rounds=500).frames > 50
 
 
 @pytest.mark.parametrize(
