@@ -113,9 +113,8 @@ class MapStore:
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = _take_lock(path)
         except OSError as error:
-            raise StoreTrouble(
-                f"{error.filename or path}: {error.strerror}; allow writing there or set [store] path"
-            ) from error
+            where = f" ({error.filename})" if error.filename not in (None, str(path)) else ""
+            raise StoreTrouble(f"{path}: {error.strerror}{where}; allow writing there or set [store] path") from error
         try:
             restored = _repair(path)
             connection = _connect(path, read_only=False)

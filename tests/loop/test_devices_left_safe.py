@@ -150,6 +150,12 @@ def test_a_laser_that_did_not_hear_is_told_again(robot: Robot, deaf_for: int | N
     assert robot.rear.is_scanning == (deaf_for is None)
 
 
+def take_terminal() -> None:
+    """As a shell in a terminal has it: that is the one whose closing is told, also where the tests run under nohup."""
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize(
     ("command", "number"),
     [("run", signal.SIGHUP), ("check --seconds 600", signal.SIGTERM), ("devices identify", signal.SIGHUP)],
@@ -166,7 +172,7 @@ def test_a_command_leaves_devices_safe_when_its_terminal_is_closed(robot: Robot,
         stdout=end,
         stderr=end,
         start_new_session=True,
-        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        preexec_fn=take_terminal,
     )
     os.close(end)
     os.set_blocking(terminal, False)

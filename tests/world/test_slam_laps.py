@@ -50,7 +50,7 @@ def test_fifty_laps_of_a_room_keep_the_views_of_some() -> None:
         if step % LAP == LAP - 1:
             held.append(slam.memory_bytes)
     assert slam.keys > 1000
-    assert max(held[25:]) <= 1.1 * max(held[:25])  # flat; arrays are made anew in steps
+    assert max(held[25:]) <= 1.25 * max(held[:25])  # flat; arrays grow by a quarter
     assert int(slam.state().views.is_there().sum()) < 800
     assert max(off) < 0.05
     assert len(slam.closures) > 100
