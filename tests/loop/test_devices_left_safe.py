@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.laser_rplidar import SPEEDS
 from drivers.reader import WireReader
 from service import assemble_wires
 from service.config import load
@@ -61,13 +62,13 @@ class Room:
 
 
 class Deaf(RpLidar):
-    """Loses what it is told after it began to scan: `deaf_for` reads of it, None for ever."""
+    """Loses what it is told after it began to scan: `deaf_for` bytes of it, None for ever."""
 
     deaf_for: int | None = 0
 
     def step(self, now_ns: int, received: bytes, baud: int | None = None) -> bytes:
         if received and self.is_scanning and self.deaf_for != 0:
-            self.deaf_for = None if self.deaf_for is None else self.deaf_for - 1
+            self.deaf_for = None if self.deaf_for is None else max(self.deaf_for - len(received), 0)
             received = b""
         return super().step(now_ns, received, baud)
 
@@ -139,7 +140,10 @@ def test_after_a_crash_stop_leaves_every_laser_dark(robot: Robot) -> None:
     wait_for("darkness", lambda: not robot.front.laser_is_on and not robot.rear.is_scanning)
 
 
-@pytest.mark.parametrize("deaf_for", [1, None], ids=["for a moment", "for ever"])
+ONE_ROUND = len(SPEEDS) * 2 * len(b"\xa5\x25")  # STOP, twice at each speed
+
+
+@pytest.mark.parametrize("deaf_for", [ONE_ROUND, None], ids=["for a moment", "for ever"])
 def test_a_laser_that_did_not_hear_is_told_again(robot: Robot, deaf_for: int | None) -> None:
     crashed(robot)
     robot.rear.deaf_for = deaf_for
