@@ -25,6 +25,9 @@ from service.topics import ALIVE, RPC, Priority
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 HEARTBEAT_S = 0.5
 _LEASE_MS = 3000
+_PORT_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
+_OTHER_PROTOCOLS = ("unixsock-stream", "unixpipe", "serial", "vsock")
+_RETRY = {"period_init_ms": 500, "period_max_ms": 1000, "period_increase_factor": 2}  # Zenoh's own rises to 4 s
 _MAX_MESSAGE_BYTES = 64 << 20
 _PRIORITIES = {priority: getattr(zenoh.Priority, priority.value) for priority in Priority}
 
@@ -39,6 +42,12 @@ class PortInUse(NetworkTrouble):
 
 class NoDaemon(NetworkTrouble):
     """Nobody answers at the endpoint of the daemon."""
+
+
+class WrongAddress(NetworkTrouble):
+    """What was given as an endpoint is none."""
+
+    exit_code = 2
 
 
 class CallFailed(NetworkTrouble):
@@ -107,7 +116,8 @@ def open_router(settings: NetworkSettings) -> zenoh.Session:
 
 
 def open_client(endpoint: str = DEFAULT_ENDPOINT, *, zenoh_config: Path | None = None) -> zenoh.Session:
-    """A session for status, view and tools. NoDaemon if nothing answers at the endpoint."""
+    """A session for status, view and tools. NoDaemon if nothing answers at the endpoint, WrongAddress if it is none."""
+    _check_address(endpoint)
     config = _base_config(zenoh_config)
     _insert(
         config,
@@ -116,6 +126,7 @@ def open_client(endpoint: str = DEFAULT_ENDPOINT, *, zenoh_config: Path | None =
             "listen/endpoints": [],
             "connect/endpoints": [endpoint],
             "transport/link/tx/lease": _LEASE_MS,
+            "connect/retry": _RETRY,
         },
     )
     try:
@@ -125,6 +136,18 @@ def open_client(endpoint: str = DEFAULT_ENDPOINT, *, zenoh_config: Path | None =
             f"no daemon answers at {endpoint}: start one with `umfeld run`, or name its address with --connect"
             f" (zenoh: {_first_line(error)})"
         ) from error
+
+
+def _check_address(endpoint: str) -> None:
+    """WrongAddress unless it is `protocol/host:port`, or another protocol's `protocol/address`."""
+    protocol, _, address = endpoint.partition("/")
+    _, _, port = address.split("?")[0].split("#")[0].rpartition(":")
+    if protocol in _PORT_PROTOCOLS:
+        fits = port.isdecimal() and 0 < int(port) < 65536
+    else:
+        fits = protocol in _OTHER_PROTOCOLS and bool(address)
+    if not fits:
+        raise WrongAddress(f"{endpoint}: is no address of a daemon; one looks like {DEFAULT_ENDPOINT} (--connect)")
 
 
 def _base_config(path: Path | None) -> zenoh.Config:

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 import webbrowser
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,11 @@ from service.locks import Claims
 from service.processes import Child, Family
 
 app = typer.Typer()
+
+COMPILING = "compiling the kernels"
+"""Of the line with which service.warm_up begins; that module is too heavy for here."""
+
+_COMPILING_TOLD_S = 10.0
 
 
 @app.command()
@@ -53,7 +59,7 @@ def demo(
             sys.stdout.flush()
             if not headless:
                 webbrowser.open(address)
-            _watch(family, seconds)
+            _watch(family, seconds, tell=typer.echo)
     except KeyboardInterrupt:
         typer.echo("ended")
     finally:
@@ -94,11 +100,23 @@ def _start_all(family: Family, folder: Path, endpoint: str, *, world: str, prese
     return address
 
 
-def _watch(family: Family, seconds: float) -> None:
-    deadline = time.monotonic() + seconds if seconds else float("inf")
-    while time.monotonic() < deadline:
+def _watch(family: Family, seconds: float, *, tell: Callable[[str], None]) -> None:
+    """Until the time is up; tell: given the line that says why the page stays empty for a while."""
+    begun = time.monotonic()
+    deadline = begun + seconds if seconds else float("inf")
+    may_compile = True
+    while (now := time.monotonic()) < deadline:
         family.check()
+        if may_compile and _compiles(family):
+            tell("The daemon compiles its kernels first, as after each update: about a minute, then the page fills.")
+            may_compile = False
+        may_compile &= now - begun < _COMPILING_TOLD_S
         time.sleep(0.2)
+
+
+def _compiles(family: Family) -> bool:
+    """Whether the daemon has said so."""
+    return any(COMPILING in child.last_lines() for child in family.children if child.name == "run")
 
 
 def _free_port() -> int:

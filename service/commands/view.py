@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import signal
+import threading
 from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -25,6 +26,8 @@ app = typer.Typer()
 DEFAULT_PORT = 8765
 DRAWN = ("scan/*", "range/*", "sectors/polar/*", "pose", "map/**", "health/json", "info")
 """What page.js takes. Each key more costs the daemon: a subscriber makes a put several times as dear."""
+_TRY_S = 0.5
+_END_S = 4.0  # undeclaring and closing the session
 _RING = 256
 _DRAIN = 64
 
@@ -47,29 +50,34 @@ def view(
     Example: umfeld view --port 8765, and from a desk: ssh -L 8765:127.0.0.1:8765 robot
     """
     from service.config_files import daemon_endpoint, find_config
-    from service.zenoh_session import Client
 
-    with Client(connect or daemon_endpoint(find_config(config))) as client:
-        try:
-            asyncio.run(_serve(client, base, port, allow_host or []))
-        except OSError as error:
-            raise Trouble(
-                f"the page's port {port} cannot be had ({error.strerror}): choose another with --port"
-            ) from error
+    endpoint = connect or daemon_endpoint(find_config(config))
+    try:
+        asyncio.run(_serve(endpoint, base, port, allow_host or []))
+    except OSError as error:
+        raise Trouble(f"the page's port {port} cannot be had ({error.strerror}): choose another with --port") from error
 
 
-async def _serve(client: Client, base: str, port: int, allow_host: Sequence[str]) -> None:
+async def _serve(endpoint: str, base: str, port: int, allow_host: Sequence[str]) -> None:
     serve, loopback_names = _page_server()
-    stop = asyncio.Event()
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for name in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(name, stop.set)
+        loop.add_signal_handler(name, stop.set)
+    troubles: list[Trouble] = []
+
+    def give_up(trouble: Trouble) -> None:
+        troubles.append(trouble)
+        loop.call_soon_threadsafe(stop.set)
+
     await serve(
-        lambda relay: _receive(client, base, relay),
+        lambda relay: _receive_when_there(endpoint, base, relay, give_up),
         port=port,
         on_ready=lambda address: print(address, flush=True),
         hosts=loopback_names | {name.lower() for name in allow_host},
         stop=stop,
     )
+    if troubles:
+        raise troubles[0]
 
 
 def _page_server() -> tuple[Callable[..., Awaitable[None]], frozenset[str]]:
@@ -84,6 +92,61 @@ def _page_server() -> tuple[Callable[..., Awaitable[None]], frozenset[str]]:
         else:
             os.environ["SSL_CERT_FILE"] = before
     return serve, frozenset(LOOPBACK_NAMES)
+
+
+def _receive_when_there(
+    endpoint: str, base: str, relay: Relay, give_up: Callable[[Trouble], None]
+) -> Callable[[], None]:
+    """Receive as soon as a daemon answers, which is tried for ever; returns what ends it. Says in a line that it waits.
+
+    give_up: told what no waiting mends, such as an address that is none. A daemon that goes and comes again is Zenoh's
+    business: the session reaches it again by itself.
+    """
+    stopping = threading.Event()
+
+    def run() -> None:
+        try:
+            client = _client_when_there(endpoint, stopping)
+        except Trouble as trouble:
+            give_up(trouble)
+            return
+        if client is not None:
+            with client, contextlib.ExitStack() as ending:
+                ending.callback(_receive(client, base, relay))
+                stopping.wait()
+
+    receiving = threading.Thread(target=run, name="view-receive", daemon=True)
+    receiving.start()
+
+    def end() -> None:
+        stopping.set()
+        receiving.join(_END_S)
+
+    return end
+
+
+def _client_when_there(endpoint: str, stopping: threading.Event) -> Client | None:
+    """The session, once it can be had; None if told to stop before."""
+    from service.zenoh_session import Client, NoDaemon
+
+    has_waited = False
+    while not stopping.is_set():
+        try:
+            client = Client(endpoint)
+        except NoDaemon:
+            if not has_waited:
+                typer.echo(
+                    f"umfeld: no daemon answers at {endpoint} yet, the page waits for it: start one with `umfeld run`, "
+                    "or name its address with --connect",
+                    err=True,
+                )
+            has_waited = True
+            stopping.wait(_TRY_S)
+        else:
+            if has_waited:
+                typer.echo(f"umfeld: a daemon answers at {endpoint}", err=True)
+            return client
+    return None
 
 
 def _receive(client: Client, base: str, relay: Relay) -> Callable[[], None]:
