@@ -30,7 +30,7 @@ COMMANDS: dict[str, str] = {
     "sim": "Emulated devices on ptys, with a configuration that fits them.",
     "devices": "Ports, the protocols that answer there, and who they are.",
     "config": "Show effective values and their origin, write an example, print the schema.",
-    "map": "Save, load, list, describe, import, export and build maps.",
+    "map": "Save, load, begin, list, describe, import, export and build maps.",
     "record": "Record raw bytes and everything published.",
     "replay": "Play a recording through the real drivers.",
     "extract": "One algorithm on one file: lines, planes, features, rooms, regions, trees, ground.",

@@ -156,7 +156,7 @@ class Daemon:
                 start_pose.x_m, start_pose.y_m, math.degrees(start_pose.yaw_rad),
                 "it is looked for there, then everywhere, before anything is drawn"
                 if config.slam.enabled and store.layers().get(SLAM)
-                else "if it was moved since, start with another [store] path or load a map",
+                else "if it was moved since, begin a new map (`umfeld map new`) or load one",
             )  # fmt: skip
         self._publisher = self._make_publisher()
         self._parts.callback(self._close_publisher)

@@ -204,6 +204,9 @@ class Localiser(Protocol):
     def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """Another map was loaded: tiles of its grid, and of its layer `slam`; the pose stays until scans tell."""
 
+    def begin_map(self, map_from_odom: Pose2) -> None:
+        """The map is empty from now on, and the odom frame lies there in it."""
+
     def kept(self) -> Callable[[], list[StoredTile]] | None:
         """What is to be stored as of now: makes the tiles of the layer `slam` that changed, in whichever thread."""
 
@@ -246,6 +249,9 @@ class OdometryOnly:
 
     def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """The robot is where it was."""
+
+    def begin_map(self, map_from_odom: Pose2) -> None:
+        self._map_from_odom = map_from_odom
 
     def kept(self) -> Callable[[], list[StoredTile]] | None:
         return None
@@ -697,6 +703,13 @@ class Fusion:
     def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """The building's grid holds these stored tiles now; the robot's pose stays. slam: that layer of the map."""
         self._parts.localiser.map_was_replaced(tiles, slam)
+
+    def begin_map(self) -> None:
+        """The building's grid was emptied: the robot stands at the origin of a new map frame, looking along x."""
+        odom_from_base = IDENTITY if self._state is None else self._state.odom_from_base
+        self._parts.localiser.begin_map(odom_from_base.inverse())
+        for grid in self._around:
+            grid.start_over()
 
     def kept_of_slam(self) -> Callable[[], list[StoredTile]] | None:
         """Makes the changed tiles of the layer `slam`, in the thread that writes; None if there is nothing to keep."""

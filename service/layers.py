@@ -14,6 +14,7 @@ from mapping.grids.evidence import EvidenceGrid
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
 from mapping.grids.rolling import RollingGrid
+from mapping.grids.tiles import TILE
 from mapping.scan import Scan
 from mapping.sectors.artos import ArtosMap
 from mapping.sectors.polar import PolarSectors
@@ -249,7 +250,10 @@ class BuildingLayer:
     def _send_full(self, stamp_ns: int, now_ns: int) -> list[Output]:
         patch = self.grid.patch(whole_tiles=True)
         if patch.cells.size == 0:
-            return []
+            if self._epoch == 0:
+                return []
+            nothing = np.full((TILE, TILE), -1, dtype=np.int8)  # what subscribers have is not true any more
+            patch = GridPatch(self.grid.resolution_m, 0, 0, nothing)
         self._epoch += 1
         self._full, self._full_ns, self._unsent, self._outgrown = patch, now_ns, False, False
         return [GridOut(stamp_ns, self._epoch, patch)]

@@ -91,6 +91,10 @@ class LineLocaliser(OdometryOnly):
         """Lines belong to the map that is gone."""
         self._ekf, self._matched_ns = None, None
 
+    def begin_map(self, map_from_odom: Pose2) -> None:
+        super().begin_map(map_from_odom)
+        self._ekf, self._matched_ns = None, None
+
     def troubles(self) -> list[str]:
         if self._unmatched < DOUBT_SCANS:
             return []

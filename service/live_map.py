@@ -7,6 +7,7 @@ exports read. The grid belongs to the fusion thread: everything that touches it 
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -18,6 +19,7 @@ from mapping.grids.tiles import TILE
 from service.errors import Trouble
 from service.layers import BuildingLayer
 from service.map_makers import MapMakers
+from service.new_map import keep_and_empty, keep_replaced, told
 from service.rpc import CallRefused
 from service.store import OCCUPANCY, SUFFIX, MapStore, SnapshotQueue, Tile, list_maps, occupancy_tiles
 
@@ -53,6 +55,9 @@ class Drawing(Protocol):
     def map_was_replaced(self, tiles: Iterable[Tile], slam: Iterable[Tile]) -> None:
         """The grid holds these stored tiles now; slam: that layer of the map."""
 
+    def begin_map(self) -> None:
+        """The grid is empty, and the robot at its origin."""
+
     def kept_of_slam(self) -> Callable[[], list[Tile]] | None:
         """Makes the changed tiles of the layer `slam`; None if there is nothing to keep."""
 
@@ -80,26 +85,29 @@ class LiveMap:
         self._ask = ask
         self._fusion = fusion
         self._makers = makers
+        self._disk = threading.RLock()  # what is on it and the live map change together: no snapshot between
         self._anchor = store.get_meta(ANCHOR) if anchor is None and store is not None else anchor
 
     # --- while running
 
     def snapshot(self) -> bool:
         """Write what changed since the last one; False if the disk refused (it is tried again with the next)."""
-        if self._queue is None:
-            return True
+        with self._disk:
+            return self._queue is None or self._write(self._queue)
+
+    def _write(self, queue: SnapshotQueue) -> bool:
         changed, pose, slam = self._ask(
             lambda: (self._layer.grid.changed_tiles(), self._fusion.pose(), self._fusion.kept_of_slam())
         )
         if slam is not None:
-            self._queue.offer(SLAM, slam())
+            queue.offer(SLAM, slam())
         if changed:
-            self._queue.offer(GRID, ((tile.tile_row, tile.tile_col, tile.payload()) for tile in changed))
-            self._queue.offer(OCCUPANCY, occupancy_of(changed), self._meta(pose))
+            queue.offer(GRID, ((tile.tile_row, tile.tile_col, tile.payload()) for tile in changed))
+            queue.offer(OCCUPANCY, occupancy_of(changed), self._meta(pose))
         for name, tiles in ({} if self._makers is None else self._makers.changed_tiles()).items():
             if tiles:
-                self._queue.offer(name, tiles)
-        return self._queue.commit()
+                queue.offer(name, tiles)
+        return queue.commit()
 
     def counters(self) -> dict[str, int]:
         """Commits and tiles written, and what failed."""
@@ -135,12 +143,13 @@ class LiveMap:
     def save(self, name: str) -> Mapping[str, Any]:
         """Write the map now, under this name beside the live one."""
         store = self._needed_store()
-        if not self.snapshot():
-            raise CallRefused(f"not saved: {self.trouble()}")
-        return store.save_as(store.path.parent / f"{name}{SUFFIX}").document()
+        with self._disk:
+            if not self.snapshot():
+                raise CallRefused(f"not saved: {self.trouble()}")
+            return store.save_as(store.path.parent / f"{name}{SUFFIX}").document()
 
     def load(self, name: str) -> Mapping[str, Any]:
-        """Replace the live map by the one saved under this name. The robot's pose stays as it is."""
+        """Replace the live map by the one saved under this name; it is kept as `replaced`. The robot's pose stays."""
         store = self._needed_store()
         path = store.path.parent / f"{name}{SUFFIX}"
         if path == store.path:
@@ -155,19 +164,41 @@ class LiveMap:
         if not tiles:
             raise CallRefused(f"{path}: holds no grid to go on with; `umfeld map import` makes one from a picture")
         self._check_tiles(path, tiles)
-        self.snapshot()  # so that nothing older waits behind what is written next
-        self._ask(lambda: self._replace(tiles, slam))
-        self._anchor = anchor
-        meta = {**self._meta(None), ANCHOR: anchor}
-        if self._makers is not None:
-            self._makers.restore(lambda name: made[name])
-        store.snapshot({GRID: tiles, OCCUPANCY: ready_made, SLAM: slam, **made}, meta, replace=True)
-        return {"name": name, "path": str(path), "tiles": len(tiles)}
+        with self._disk:
+            if not self.snapshot():  # else older tiles would wait behind what is written next
+                raise CallRefused(f"not loaded: {self.trouble()}; the live map is as it was")
+            kept = keep_replaced(store)
+            meta = {**self._meta(None), ANCHOR: anchor}
+            store.snapshot({GRID: tiles, OCCUPANCY: ready_made, SLAM: slam, **made}, meta, replace=True)
+            self._anchor = anchor
+            self._ask(lambda: self._replace(tiles, slam, made))
+        return {"name": name, "path": str(path), "tiles": len(tiles), "kept": kept}
 
-    def _replace(self, tiles: list[Tile], slam: list[Tile]) -> None:
+    def _replace(self, tiles: list[Tile], slam: list[Tile], made: Mapping[str, list[Tile]]) -> None:
         self._fusion.drain()
         replace_tiles(self._layer, tiles)
         self._fusion.map_was_replaced(tiles, slam)
+        if self._makers is not None:
+            self._makers.replace(made)
+
+    def new(self, name: str | None = None) -> Mapping[str, Any]:
+        """Keep the live map under this name, None: by the time, and begin an empty one where the robot stands."""
+        store = self._needed_store()
+        with self._disk:
+            if not self.snapshot():
+                raise CallRefused(f"no new map is begun, since the old one cannot be kept: {self.trouble()}")
+            answer = keep_and_empty(store, name, wall_ns=store.wall_ns())
+            self._anchor = None
+            self._ask(self._begin)
+        log.warning("%s", told(answer))
+        return answer
+
+    def _begin(self) -> None:
+        self._fusion.drain()
+        replace_tiles(self._layer, ())
+        self._fusion.begin_map()
+        if self._makers is not None:
+            self._makers.replace({})
 
     def _check_tiles(self, path: Path, tiles: Iterable[Tile]) -> None:
         """Load them aside first: the live map is replaced as a whole or not at all."""
@@ -238,7 +269,7 @@ def check_fits(grid: OccupancyGrid, store: MapStore) -> None:
 
 def replace_tiles(layer: BuildingLayer, tiles: Iterable[Tile]) -> None:
     """Forget the live grid and take these tiles instead."""
-    layer.grid.clear()
+    layer.grid.start_anew()
     for row, column, payload in tiles:
         layer.grid.load_tile(row, column, payload)
     layer.start_anew()
@@ -251,5 +282,5 @@ def occupancy_of(changed: Iterable[GridTile]) -> list[Tile]:
         model: Model = tile.model
         alone = OccupancyGrid(resolution_m=tile.resolution_m, model=model, max_tiles=1)
         alone.load_tile(tile.tile_row, tile.tile_col, tile.payload())
-        found.extend(occupancy_tiles(alone.patch(whole_tiles=True), TILE))
+        found.extend(occupancy_tiles(alone.patch(whole_tiles=True), TILE, also_unknown=True))
     return found

@@ -168,6 +168,9 @@ class KnownMapLocaliser:
     def map_was_replaced(self, tiles: Iterable[StoredTile], slam: Iterable[StoredTile]) -> None:
         """Nobody can: there is no map service in this mode."""
 
+    def begin_map(self, map_from_odom: Pose2) -> None:
+        """Nobody can, either."""
+
     def outputs(self, now_ns: int) -> list[Output]:
         if self._placed is None:
             return []

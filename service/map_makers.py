@@ -170,6 +170,7 @@ class MapMakers:
         self._now_ns = now_ns
         self._sweeps: deque[Sweep] = deque()
         self._redrawn: Sequence[Callable[[], Sweep]] | None = None
+        self._replaced: Mapping[str, Sequence[Tile]] | None = None
         self._grids: deque[GridOut | GridUpdateOut] = deque()
         self._clouds: deque[CloudOut] = deque()
         self._looks: deque[LookOut] = deque()
@@ -266,6 +267,7 @@ class MapMakers:
     def ask(self, work: Callable[[], T]) -> T:
         """Run a function between two turns and give its result: for calls that look into a maker's map."""
         if not self._thread.is_alive() or threading.current_thread() is self._thread:
+            self._take_replaced()
             return work()
         done, result = threading.Event(), list[object]()
         with self._changed:
@@ -284,17 +286,39 @@ class MapMakers:
 
     def restore(self, load: Callable[[str], Iterable[Tile]]) -> None:
         """Take up every maker's map from the store's layers; a damaged one begins empty and says so."""
+        self.ask(partial(self._take_up, load))
 
-        def take() -> None:
-            for desk in self._desks:
-                try:
-                    desk.is_fed = True  # so that what was taken up is published
-                    desk.maker.restore(load(layer_of(desk.maker)))
-                except ValueError as error:
-                    log.error("%s: begins empty: what was stored cannot be used: %s", desk.maker.name, error)
-                    desk.maker.restore(())
+    def replace(self, layers: Mapping[str, Sequence[Tile]]) -> None:
+        """Another map is the live one from now on: what these layers hold of it; the others are empty. Never blocks.
 
-        self.ask(take)
+        What waits was measured in the map before and is left out; what comes after this call belongs to the new one.
+        """
+        with self._changed:
+            self._replaced, self._redrawn = layers, None
+            for waiting in (self._sweeps, self._grids, self._clouds, self._looks, self._odometry):
+                waiting.clear()
+            self._changed.notify_all()
+
+    def _take_up(self, load: Callable[[str], Iterable[Tile]]) -> None:
+        for desk in self._desks:
+            try:
+                desk.is_fed = True  # so that what was taken up is published
+                desk.maker.restore(load(layer_of(desk.maker)))
+            except ValueError as error:
+                log.error("%s: begins empty: what was stored cannot be used: %s", desk.maker.name, error)
+                desk.maker.restore(())
+
+    def _take_replaced(self) -> None:
+        with self._changed:
+            layers, self._replaced = self._replaced, None
+        if layers is None:
+            return
+        self._mirror = _Mirror()
+        self._take_up(lambda layer: layers.get(layer, ()))
+        for desk in self._desks:
+            desk.changed = None
+            if isinstance(desk.maker, TellsMotion):
+                self._guard(desk, desk.maker.map_moved)
 
     def counters(self) -> Mapping[str, int]:
         """Our own, and those of makers that count."""
@@ -309,7 +333,7 @@ class MapMakers:
     def _run(self) -> None:
         while True:
             with self._changed:
-                if not (self._stopping or self._asked):
+                if not (self._stopping or self._asked or self._replaced is not None):
                     self._changed.wait(_TURN_S)
                 last = self._stopping
             self.turn(self._now_ns())
@@ -318,6 +342,7 @@ class MapMakers:
 
     def turn(self, now_ns: int) -> None:
         """Work off what waits; tests call it without the thread."""
+        self._take_replaced()
         with self._changed:
             sweeps, self._sweeps = self._sweeps, deque()
             grids, self._grids = self._grids, deque()

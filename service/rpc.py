@@ -23,6 +23,7 @@ _A_MAP = "a map: [grid] with a laser or sonars, and [store] enabled"
 _NEEDS = {
     "save_map": _A_MAP,
     "load_map": _A_MAP,
+    "new_map": _A_MAP,
     "list_maps": _A_MAP,
     "map_info": _A_MAP,
     "plan": "[rooms] enabled and a grid",
@@ -50,6 +51,9 @@ class MapService(Protocol):
     def load(self, name: str) -> Mapping[str, Any]:
         """Replace the live map by the one saved under this name."""
 
+    def new(self, name: str | None) -> Mapping[str, Any]:
+        """Keep the live map under this name, None: by the time, and begin an empty one where the robot stands."""
+
     def list(self) -> Mapping[str, Any]:
         """{"maps": [{name, path, bytes, ...}]}: what can be loaded."""
 
@@ -76,9 +80,10 @@ class Calls:
         self._handlers[name] = handler
 
     def register_map_service(self, service: MapService) -> None:
-        """save_map, load_map, list_maps, map_info."""
+        """save_map, load_map, new_map, list_maps, map_info."""
         self.register("save_map", lambda arguments: service.save(map_name(arguments)))
         self.register("load_map", lambda arguments: service.load(map_name(arguments)))
+        self.register("new_map", lambda arguments: service.new(map_name(arguments) if "name" in arguments else None))
         self.register("list_maps", lambda _arguments: service.list())
         self.register("map_info", lambda _arguments: service.info())
 

@@ -239,6 +239,10 @@ class SlamLocaliser:
         if stored is not None:
             self._resume(stored)
 
+    def begin_map(self, map_from_odom: Pose2) -> None:
+        self.map_was_replaced((), ())
+        self._map_from_odom = map_from_odom
+
     def kept(self) -> Callable[[], list[StoredTile]] | None:
         if self._redrawer is None or not self._slam.keys:
             return None
@@ -263,7 +267,7 @@ class SlamLocaliser:
         if not self.is_placed() and self._searches:
             return [
                 f"the robot does not find itself in the map ({self._searches} searches): nothing is drawn "
-                "meanwhile; drive it to where the map is known, or begin a new map with another [store] path"
+                "meanwhile; drive it to where the map is known, or begin a new one (`umfeld map new`)"
             ]
         if self._slam.lost_scans < DOUBT_SCANS:
             return []

@@ -206,6 +206,10 @@ class MapStore:
         with self._mutex, _explained(self.path):
             return {key: json.loads(value) for key, value in self._db.execute("SELECT key, value FROM meta")}
 
+    def wall_ns(self) -> int:
+        """Now, by the clock of its snapshots."""
+        return self._wall_ns()
+
     def get_meta(self, key: str, default: Any = None) -> Any:
         """One meta value, anything JSON can say."""
         return self.meta().get(key, default)
@@ -422,8 +426,11 @@ def unpack_array(payload: bytes) -> NDArray[Any]:
         raise StoreTrouble(f"a tile is not an array: {error}") from error
 
 
-def occupancy_tiles(patch: GridPatch, tile_cells: int) -> Iterator[Tile]:
-    """A grid cut into the tiles of the layer OCCUPANCY; tiles that are unknown throughout are left out."""
+def occupancy_tiles(patch: GridPatch, tile_cells: int, *, also_unknown: bool = False) -> Iterator[Tile]:
+    """A grid cut into the tiles of the layer OCCUPANCY.
+
+    also_unknown: tiles that are unknown throughout as well, which take the place of what was known there before.
+    """
     rows, columns = patch.cells.shape
     for row in range(patch.row0 // tile_cells, -(-(patch.row0 + rows) // tile_cells)):
         for column in range(patch.col0 // tile_cells, -(-(patch.col0 + columns) // tile_cells)):
@@ -433,7 +440,7 @@ def occupancy_tiles(patch: GridPatch, tile_cells: int) -> Iterator[Tile]:
             tile[max(0, -top) : max(0, -top) + source.shape[0], max(0, -left) : max(0, -left) + source.shape[1]] = (
                 source
             )
-            if (tile >= 0).any():
+            if also_unknown or (tile >= 0).any():
                 yield row, column, pack_array(tile)
 
 

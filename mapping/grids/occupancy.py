@@ -303,6 +303,11 @@ class OccupancyGrid(EvidenceGrid):
                 self._pool.sonar_of_slot(int(slot))[:] = 0
             self._pool.flags[slot] = 0xFF
 
+    def start_anew(self) -> None:
+        """Forget everything, the tiles as well; no change says so: whoever publishes sends the grid whole."""
+        self._pool.drop_all()
+        self._published.clear()
+
 
 def trimmed(patch: GridPatch) -> GridPatch:
     """The same cells without unknown rows and columns at the rim."""

@@ -142,6 +142,12 @@ class TilePool:
         self.free_slots[count] = slot
         self.state[kernels.FREE_COUNT] = count + 1
 
+    def drop_all(self) -> None:
+        """Forget every tile, and the table."""
+        for slot in self.slots():
+            self.drop(int(slot))
+        self.index, self.tile_row0, self.tile_col0 = np.zeros((0, 0), dtype=np.int32), 0, 0
+
     @property
     def has_sonar(self) -> bool:
         """Whether a cone was ever inserted."""

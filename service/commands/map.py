@@ -86,7 +86,60 @@ def load(
     """
     with _client(connect, config) as client:
         answer = client.call(_base(client, robot), "load_map", {"name": name}, timeout_s=60.0)
-    _report(answer, as_json)
+    if as_json:
+        _report(answer, as_json)
+    else:
+        kept = f"; the map before is kept as {answer['kept']}" if answer.get("kept") else ""
+        typer.echo(f"{name} is the live map now{kept}")
+
+
+@app.command()
+def new(
+    name: Annotated[
+        str | None, typer.Argument(help="What the map so far is kept as, one word; none: `until-` and the time.")
+    ] = None,
+    *,
+    store: Store = None,
+    connect: Connect = None,
+    config: Config = None,
+    robot: Robot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Begin an empty map where the robot stands, as after it was carried to another house; the one so far is kept.
+
+    Example: umfeld map new old-house
+    """
+    from service.new_map import told
+
+    arguments = {} if name is None else {"name": name}
+    if store is not None:
+        answer = _emptied(store, arguments)
+    else:
+        with _client(connect, config) as client:
+            answer = client.call(_base(client, robot), "new_map", arguments, timeout_s=60.0)
+    if as_json:
+        _report(answer, as_json)
+    else:
+        typer.echo(told(answer))
+
+
+def _emptied(path: Path, arguments: Mapping[str, str]) -> Mapping[str, Any]:
+    """As new_map, of a map file that no daemon writes."""
+    import time
+
+    from service.new_map import keep_and_empty
+    from service.rpc import map_name
+    from service.store import MapStore, StoreInUse, StoreTrouble
+
+    name = map_name(arguments) if arguments else None
+    if not path.is_file():
+        raise StoreTrouble(f"{path}: there is no such map; a daemon makes one by itself")
+    try:
+        opened = MapStore.open(path, wall_ns=time.time_ns)
+    except StoreInUse as trouble:
+        raise StoreTrouble(f"{trouble}, or leave --store out: then that daemon does it") from trouble
+    with opened:
+        return keep_and_empty(opened, name, wall_ns=time.time_ns())
 
 
 @app.command("list")

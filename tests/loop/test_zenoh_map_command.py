@@ -38,7 +38,12 @@ class Maps:
         if not (self.folder / f"{name}.umfeld").exists():
             raise CallRefused(f"there is no map {name}")
         self.loaded = name
-        return {"name": name}
+        return {"name": name, "kept": "replaced"}
+
+    def new(self, name: str | None) -> dict[str, Any]:
+        if name is None:
+            return {"kept": None, "path": "/maps/live.umfeld"}
+        return {"kept": {"name": name, "path": f"/maps/{name}.umfeld"}, "path": "/maps/live.umfeld"}
 
     def list(self) -> dict[str, Any]:
         return {"maps": list_maps(self.folder)}
@@ -84,7 +89,8 @@ def test_save_list_load_info_of_a_daemon(umfeld: Run, endpoint: str) -> None:
     code, out, _ = umfeld("list", "--connect", endpoint)
     assert code == 0
     assert out.startswith("kitchen ")
-    assert umfeld("load", "kitchen", "--connect", endpoint)[0] == 0
+    code, out, _ = umfeld("load", "kitchen", "--connect", endpoint)
+    assert (code, out) == (0, "kitchen is the live map now; the map before is kept as replaced\n")
     code, out, err = umfeld("load", "attic", "--connect", endpoint)
     assert (code, out) == (1, "")
     assert "there is no map attic" in err
@@ -100,6 +106,41 @@ def test_save_list_load_info_of_a_daemon(umfeld: Run, endpoint: str) -> None:
     code, out, err = umfeld("info", "attic", "--connect", endpoint)
     assert (code, out) == (2, "")
     assert "(kitchen)" in err
+
+
+def test_a_new_map_of_a_daemon_in_one_line(umfeld: Run, endpoint: str) -> None:
+    code, out, _ = umfeld("new", "flat", "--connect", endpoint)
+    assert code == 0
+    assert out == ("a new map begins; the one before is kept as flat (umfeld map load flat): /maps/flat.umfeld\n")
+    code, out, _ = umfeld("new", "--connect", endpoint, "--json")
+    assert json.loads(out) == {"kept": None, "path": "/maps/live.umfeld"}
+    code, _, err = umfeld("new", "../evil", "--connect", endpoint)
+    assert code == 1
+    assert "one word" in err
+
+
+def test_a_new_map_of_a_file(umfeld: Run, tmp_path: Path) -> None:
+    live = write_occupancy_map(GridPatch(0.1, 0, 0, CELLS), tmp_path / "live.umfeld", source="x").path
+    with MapStore.open(live, wall_ns=lambda: 0):  # a daemon has it
+        code, _, err = umfeld("new", "flat", "--store", live)
+        assert code == 1
+        assert "leave --store out" in err
+    code, _, err = umfeld("new", "a/b", "--store", live)
+    assert code == 1
+    assert "one word" in err
+    code, out, _ = umfeld("new", "flat", "--store", live)
+    assert code == 0
+    assert "kept as flat" in out
+    assert {each["name"]: each["layers"] for each in list_maps(tmp_path)} == {
+        "flat": {"occupancy": 1},
+        "live": {},
+    }
+    code, out, _ = umfeld("new", "--store", live)
+    assert (code, out) == (0, "a new map begins; the one before held nothing\n")
+    code, _, err = umfeld("new", "--store", tmp_path / "absent.umfeld")
+    assert code == 1
+    assert "no such map" in err
+    assert not (tmp_path / "absent.umfeld").exists()
 
 
 def test_export_of_the_live_grid(umfeld: Run, endpoint: str, tmp_path: Path) -> None:

@@ -291,6 +291,7 @@ class Standing:
 
     at: Pose2 | None
     replaced_by: list[tuple[int, int, bytes]] = field(default_factory=list)
+    maps_begun: int = 0
 
     def pose(self) -> Pose2 | None:
         return self.at
@@ -300,6 +301,10 @@ class Standing:
 
     def map_was_replaced(self, tiles: Iterable[tuple[int, int, bytes]], slam: Iterable[tuple[int, int, bytes]]) -> None:
         self.replaced_by = list(tiles)
+
+    def begin_map(self) -> None:
+        self.maps_begun += 1
+        self.at = Pose2()
 
     def kept_of_slam(self) -> None:
         return None
@@ -369,7 +374,7 @@ def test_saving_and_loading_by_name(store: MapStore) -> None:
     assert keeper.load("kitchen")["tiles"] == len(store.load_tiles(GRID))
     np.testing.assert_array_equal(layer.grid.patch().cells, kitchen.cells)
     np.testing.assert_array_equal(occupancy_patch(store).cells, kitchen.cells)
-    assert {each["name"] for each in keeper.list()["maps"]} == {"kitchen", "live"}
+    assert {each["name"] for each in keeper.list()["maps"]} == {"kitchen", "live", "replaced"}
     assert keeper.info()["occupied_cells"] > 10
     with pytest.raises(Trouble, match="kitche"):
         keeper.load("kitche")
@@ -406,6 +411,124 @@ def test_a_torn_map_is_not_loaded_and_the_live_one_stays(store: MapStore) -> Non
     with pytest.raises(CallRefused, match=r"torn.*live map is as it was"):
         keeper.load("torn")
     np.testing.assert_array_equal(layer.grid.patch().cells, before.cells)
+
+
+def names_beside(store: MapStore) -> set[str]:
+    return {path.stem for path in store.path.parent.glob("*.umfeld")}
+
+
+def refusing(*_: object, **__: object) -> int:
+    raise StoreNotWritten("m.umfeld: not saved: database or disk is full; free some space")
+
+
+def test_a_new_map_begins_empty_and_the_one_before_is_kept(store: MapStore) -> None:
+    layer, robot = building(), Standing(Pose2(30.0, -5.0, 1.0))
+    keeper = LiveMap(layer, store, ask=lambda work: work(), fusion=robot)
+    draw(layer, 0.0)
+    draw(layer, 30.0, -5.0)
+    old = layer.grid.patch()
+    answer = keeper.new("old-house")
+    assert answer["kept"]["name"] == "old-house"
+    assert robot.maps_begun == 1
+    assert (layer.grid.patch().cells.size, store.load_tiles(GRID), store.get_meta("pose")) == (0, [], None)
+    with MapStore.open(Path(answer["kept"]["path"]), wall_ns=lambda: 0, read_only=True) as kept:
+        np.testing.assert_array_equal(occupancy_patch(kept).cells, old.cells)
+    draw(layer, 100.0)
+    keeper.snapshot()
+    again = building()
+    restore(again.grid, store)
+    new = again.grid.patch()
+    assert (new.row0, new.cells.shape) == (layer.grid.patch().row0, layer.grid.patch().cells.shape)
+    assert new.cells.shape[1] * 0.05 < 10.0, "nothing of the old house is in it"
+    keeper.load("old-house")  # and back
+    np.testing.assert_array_equal(layer.grid.patch().cells, old.cells)
+
+
+def test_a_new_map_needs_no_name_and_replaces_none(store: MapStore) -> None:
+    layer = building()
+    keeper = live(layer, store)
+    assert keeper.new()["kept"] is None, "there was nothing"
+    for number in range(3):
+        draw(layer, float(number))
+        assert keeper.new()["kept"] is not None
+    assert names_beside(store) == {
+        "live",
+        "until-19700101-000000",
+        "until-19700101-000000-2",
+        "until-19700101-000000-3",
+    }
+    draw(layer, 0.0)
+    for name, why in (("until-19700101-000000", "there already"), ("live", "the live map's own")):
+        with pytest.raises(Trouble, match=f"{name}: is {why}"):
+            keeper.new(name)
+    assert layer.grid.patch().cells.size
+    assert store.load_tiles(GRID)
+
+
+@pytest.mark.parametrize("refused", ["snapshot", "save_as"])
+def test_a_full_disk_lets_the_old_map_go_on(store: MapStore, monkeypatch: pytest.MonkeyPatch, refused: str) -> None:
+    layer = building()
+    keeper = live(layer, store)
+    draw(layer, 0.0)
+    keeper.save("kitchen")
+    draw(layer, 10.0)
+    before = layer.grid.patch().cells
+    with monkeypatch.context() as full:
+        full.setattr(MapStore, refused, refusing)
+        with pytest.raises(Trouble, match="free some space"):
+            keeper.new()
+        with pytest.raises(Trouble, match="free some space"):
+            keeper.load("kitchen")
+    np.testing.assert_array_equal(layer.grid.patch().cells, before)
+    keeper.snapshot()
+    np.testing.assert_array_equal(occupancy_patch(store).cells, before)
+
+
+def test_a_map_that_is_replaced_by_a_loaded_one_can_be_loaded_again(store: MapStore) -> None:
+    layer = building()
+    keeper = live(layer, store)
+    draw(layer, 0.0)
+    keeper.save("kitchen")
+    draw(layer, 20.0)
+    unsaved = layer.grid.patch().cells
+    assert keeper.load("kitchen")["kept"] == "replaced"
+    assert keeper.load("replaced")["kept"] == "replaced"
+    np.testing.assert_array_equal(layer.grid.patch().cells, unsaved)
+    keeper.load("replaced")
+    assert layer.grid.patch().cells.shape[1] < unsaved.shape[1]
+
+
+def test_ground_that_is_unknown_again_is_so_in_the_file_as_well(store: MapStore) -> None:
+    """After a correction of the map: what other programs read of the file may be no freer than the live map."""
+    layer = building()
+    keeper = live(layer, store)
+    draw(layer, 0.0)
+    draw(layer, 30.0)
+    keeper.snapshot()
+    layer.grid.clear()
+    draw(layer, 0.0)
+    keeper.snapshot()
+    np.testing.assert_array_equal(occupancy_patch(store).cells, layer.grid.patch().cells)
+
+
+def test_subscribers_of_a_new_map_are_told_that_nothing_is_known(store: MapStore) -> None:
+    layer, mirror = building(), Mirror()
+    keeper = live(layer, store)
+    draw(layer, 40.0)
+    for output in layer.outputs(None, 0, SECOND):
+        mirror.take(output, SECOND)
+    assert (mirror.full.cells >= 0).any()
+    keeper.new()
+    for output in layer.outputs(None, 0, 2 * SECOND):
+        mirror.take(output, 2 * SECOND)
+    assert (mirror.full.cells == -1).all()
+    draw(layer, 0.0)
+    for now_ns in (3 * SECOND, 4 * SECOND):
+        for output in layer.outputs(None, 0, now_ns):
+            mirror.take(output, now_ns)
+    truth = layer.grid.patch(whole_tiles=True)
+    np.testing.assert_array_equal(mirror.full.cells, truth.cells)
+    assert truth.cells.shape[1] * 0.05 < 13.0, "as wide as the new map, not as both"
 
 
 def test_without_a_store_calls_are_refused_in_words() -> None:

@@ -388,6 +388,19 @@ def test_wheels_move_the_robot() -> None:
     assert outputs[1].map_from_odom == IDENTITY
 
 
+def test_a_new_map_begins_where_the_robot_stands() -> None:
+    b = bench()
+    b.fusion.on_item("drive", wheels(0, 0, 0), 0)
+    b.fusion.on_item("drive", wheels(100 * MS, 100, 140), 100 * MS)
+    b.fusion.begin_map()
+    pose = b.fusion.pose()
+    assert pose is not None
+    assert (pose.x_m, pose.y_m, pose.yaw_rad) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+    outputs = b.fusion.on_item("drive", wheels(200 * MS, 200, 240), 200 * MS)
+    assert isinstance(outputs[1], PoseOut)
+    assert (outputs[1].map_from_base.x_m, outputs[1].map_from_base.y_m) == pytest.approx((0.1, 0.0), abs=1e-9)
+
+
 def test_a_pose_is_published_at_most_forty_times_a_second() -> None:
     b = bench()
     poses = [

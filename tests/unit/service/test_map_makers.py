@@ -82,6 +82,26 @@ def test_a_maker_is_called_when_something_changed_and_its_period_is_over() -> No
     assert len(notes.views) == len(told) == 2  # nothing new
 
 
+def test_a_map_that_replaces_another_begins_without_what_was_measured_in_that() -> None:
+    notes = Notebook(sources=("front",))
+    makers, _ = makers_of(notes)
+    makers.take_output(grid(np.full((2, 2), 100, dtype=np.int8)))
+    makers.take_sweep("front", SCAN, np.zeros((1, 3)))
+    makers.turn(0)
+    makers.take_sweep("front", SCAN, np.zeros((1, 3)))
+    makers.take_output(GridUpdateOut(10, 1, GridPatch(0.05, 1, 1, np.full((1, 1), 100, dtype=np.int8))))
+    makers.replace({"maker-notes": [(3, 4, b"other")]})
+    makers.take_sweep("front", SCAN, np.zeros((1, 3)))
+    makers.take_output(grid(np.zeros((1, 1), dtype=np.int8), epoch=2))
+    makers.turn(SECOND)
+    assert notes.kept == [(3, 4, b"other")]
+    assert len(notes.sweeps) == 2, "one before and one after"
+    assert notes.grids[-1].cells.tolist() == [[0]]
+    makers.replace({})
+    assert makers.changed_tiles() == {"maker-notes": [(0, 0, b"notes")]}
+    assert notes.kept == [], "taken up before anything is asked"
+
+
 def test_updates_of_another_epoch_and_grids_of_other_names_change_nothing() -> None:
     notes = Notebook()
     makers, _ = makers_of(notes)

@@ -273,6 +273,9 @@ class Maps:
     def load(self, name: str) -> dict[str, Any]:
         raise CallRefused(f"no map {name}")
 
+    def new(self, name: str | None) -> dict[str, Any]:
+        return {"kept": name}
+
     def list(self) -> dict[str, Any]:
         return {"maps": []}
 
@@ -283,15 +286,21 @@ class Maps:
 def test_the_map_service_answers_its_calls() -> None:
     calls = Calls("robots/r")
     calls.register_map_service(Maps())
-    assert calls.names == ["list_maps", "load_map", "map_info", "save_map"]
+    assert calls.names == ["list_maps", "load_map", "map_info", "new_map", "save_map"]
     ask = started(calls)
-    answers = {}
-    for name, payload in (("save_map", b'{"name":"flat"}'), ("load_map", b'{"name":"x"}'), ("map_info", None)):
+    answers: list[Any] = []
+    for name, payload in (
+        ("save_map", b'{"name":"flat"}'),
+        ("load_map", b'{"name":"x"}'),
+        ("map_info", None),
+        ("new_map", None),
+        ("new_map", b'{"name":"old"}'),
+    ):
         query = FakeQuery(f"robots/r/@rpc/{name}", payload)
         ask(query)
         assert query.ended.wait(GIVE_UP_S)
-        answers[name] = query.replies or query.errors
-    assert answers == {"save_map": [{"saved": "flat"}], "load_map": ["no map x"], "map_info": [{"rows": 3}]}
+        answers.extend(query.replies or query.errors)
+    assert answers == [{"saved": "flat"}, "no map x", {"rows": 3}, {"kept": None}, {"kept": "old"}]
     calls.stop(5)
 
 

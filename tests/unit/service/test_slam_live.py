@@ -251,3 +251,20 @@ def test_a_robot_that_was_never_found_may_be_anywhere_though_track_is_lost(left_
         again.take_scan("front", Scan(stamp_ns, 0.0, BEARING, seen_from(place), 0.05, 20.0), odometry, Pose2())
     assert again.is_placed()
     assert math.hypot(again.map_from_odom().x_m - place.x_m, again.map_from_odom().y_m - place.y_m) < 0.1
+
+
+def test_a_map_that_begins_has_the_robot_where_it_is_said_to_be(driver: Driver) -> None:
+    """Nothing of the map before is held against the next scans: they are drawn, by odometry, from the new origin."""
+    localiser = driver.localiser
+    odom = driver.odometry.at(driver.stamp_ns)
+    localiser.begin_map(odom.inverse())
+    assert localiser.slam.keys == 0
+    assert localiser.is_placed()
+    assert localiser.troubles() == []
+    driver.drive(3)
+    assert localiser.slam.keys
+    map_from_base = localiser.map_from_odom() @ driver.odometry.at(driver.stamp_ns)
+    expected = odom.inverse() @ driver.odometry.at(driver.stamp_ns)
+    assert map_from_base.x_m == pytest.approx(expected.x_m, abs=0.02)
+    assert map_from_base.y_m == pytest.approx(expected.y_m, abs=0.02)
+    assert localiser.counters()["slam.scans_not_drawn"] == 0
