@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.deskew import beam_stamps, deskew
-from mapping.frames import IDENTITY, Pose2, compose_covariance
+from mapping.frames import IDENTITY, Pose2, compose_covariance, exp_se2
 from mapping.localise.closure_records import Closure, WorkResult
-from mapping.localise.placing import Placing
+from mapping.localise.placing import LEFT_M, LEFT_QUALITY, LEFT_RAD, Placing
 from mapping.localise.slam import Slam
 from mapping.localise.slam_records import SlamSettings, SlamUpdate
 from mapping.localise.sweep_change import Depths, depths_of, is_changed
@@ -59,6 +59,13 @@ SEARCH_NS = 5_000_000_000  # then it is looked for again
 SEARCH_M = 1.0
 CARRIED_M_S = 1.5  # by somebody who walks, or on its own wheels
 CARRIED_M = 1.0
+DRIVEN_M = 0.5  # by its own wheels it comes as far as at the fastest that it was seen to go, and a little more
+DRIVEN_SHARE = 1.2
+DRIVEN_M_S = 0.3
+DRIVEN_RAD = 0.35
+DRIVEN_RAD_S = 0.7  # less than it can: a place that fits only a robot that has turned round is most often another one
+BRIDGED_S = 0.5  # so far ahead the motion is predicted where odometry is missing
+STRAYED = 0.1  # of the way since, which odometry may be off
 NOT_PLACED_COVARIANCE: F64 = np.diag([100.0, 100.0, 10.0])
 _GRAPH_PERIOD_NS = 1_000_000_000
 _KEYS_A_SECOND = 2_000  # larger graphs are sent more seldom
@@ -75,11 +82,22 @@ class _Search:
 
 @dataclass(frozen=True, slots=True)
 class _Lost:
-    """left: where in the map the robot was seen last.  odom: where odometry went on, reach_m around there at most."""
+    """left: where in the map the robot was seen last.  odom: where odometry went on, reach_m around there at most.
+    ahead: how far the motion of then would have carried it; None: it stood, and may stand where it was left.
+    turn_rad: how far it can have turned.
+    """
 
     left: Pose2
     odom: Pose2
     reach_m: float
+    ahead: Pose2 | None = None
+    turn_rad: float = math.pi
+
+    def can_have_come(self, map_from_base: Pose2, odom: Pose2, strayed_m: float) -> bool:
+        """Whether a robot that is there now, odometry there, can have been lost here. strayed_m: odometry's error."""
+        then = map_from_base @ (odom.inverse() @ self.odom)
+        off = self.left.inverse() @ then
+        return math.hypot(off.x_m, off.y_m) <= self.reach_m + strayed_m and abs(off.yaw_rad) <= self.turn_rad
 
 
 @dataclass(slots=True)
@@ -110,8 +128,8 @@ class SlamLocaliser:
     ) -> None:
         """sources: lasers that are matched.  start: map_from_odom before the first scan.  submit: where closures are
         looked for.  redrawer: draws the map again after a correction.  stored: the map to go on in, where the robot is
-        first looked for.  lost_when_broken: where odometry has lost track the robot is looked for again, as far around
-        as it can have been carried meanwhile.
+        first looked for.  lost_when_broken: wherever odometry has lost track the robot is looked for again, as far
+        around as it can have come meanwhile; else only after a gap that no prediction bridges.
         """
         self._sources = frozenset(sources)
         self._settings = settings
@@ -126,7 +144,9 @@ class SlamLocaliser:
         self._update_odom = IDENTITY
         self._is_broken = False
         self._lost_when_broken = lost_when_broken
-        self._odometry_ns = 0
+        self._odometry: OdometryState | None = None
+        self._way_m = 0.0  # since it was lost
+        self._fastest_m_s = 0.0
         self._lost: _Lost | None = None
         self._search: _Search | None = None
         self._searched: tuple[int, Pose2] | None = None  # stamp and odometry of the last search
@@ -159,21 +179,33 @@ class SlamLocaliser:
 
     def take_odometry(self, state: OdometryState) -> None:
         self._is_broken |= state.broken
-        if state.broken and self._lost_when_broken and self._slam.keys:
-            self._unplace(state.odom_from_base, (state.stamp_ns - self._odometry_ns) * 1e-9)
-        self._odometry_ns = state.stamp_ns
+        before = self._odometry
+        if before is not None and self._slam.keys:
+            seconds = (state.stamp_ns - before.stamp_ns) * 1e-9
+            if state.broken and (self._lost_when_broken or seconds > BRIDGED_S):
+                if self._lost_when_broken:  # by its laser: somebody may have carried it off
+                    self._unplace(state.odom_from_base, CARRIED_M + CARRIED_M_S * seconds)
+                else:
+                    reach_m = DRIVEN_M + max(DRIVEN_SHARE * self._fastest_m_s, DRIVEN_M_S) * seconds
+                    turn_rad = DRIVEN_RAD + DRIVEN_RAD_S * seconds
+                    self._unplace(state.odom_from_base, reach_m, _way_ahead(before, seconds), turn_rad)
+            elif self._lost is not None:
+                step = before.odom_from_base.inverse() @ state.odom_from_base
+                self._way_m += math.hypot(step.x_m, step.y_m)
+        self._odometry = state
+        self._fastest_m_s = max(self._fastest_m_s, min(abs(state.forward_m_s), CARRIED_M_S))
 
-    def _unplace(self, odom: Pose2, seconds: float) -> None:
+    def _unplace(self, odom: Pose2, reach_m: float, ahead: Pose2 | None = None, turn_rad: float = math.pi) -> None:
         """Where the robot is in the map is not known any more: it is looked for, and nothing is drawn meanwhile.
 
-        odom: where odometry goes on.  seconds: how long it moved unseen before.
+        odom: where odometry goes on.  reach_m: how far it can have come unseen before.  ahead, turn_rad: see _Lost.
         """
-        reach_m = CARRIED_M + CARRIED_M_S * seconds
         if self._lost is not None:  # once more before it was found
             way = self._lost.odom.inverse() @ odom
-            self._lost = _Lost(self._lost.left, odom, self._lost.reach_m + math.hypot(way.x_m, way.y_m) + reach_m)
+            reach_m += self._lost.reach_m + math.hypot(way.x_m, way.y_m)
+            self._lost = _Lost(self._lost.left, odom, reach_m, self._lost.ahead or IDENTITY, math.pi)
         elif self.is_placed():  # in a stored map it may be anywhere
-            self._lost = _Lost(self._map_from_odom @ odom, odom, reach_m)
+            self._lost, self._way_m = _Lost(self._map_from_odom @ odom, odom, reach_m, ahead, turn_rad), 0.0
         self._update, self._search, self._searched = None, None, None
         self._searches, self._hypotheses = 0, (IDENTITY, ())
         self._looked.clear()
@@ -377,7 +409,7 @@ class SlamLocaliser:
             if scan.stamp_ns - before_ns < SEARCH_NS and math.hypot(way.x_m, way.y_m) < SEARCH_M:
                 return False
         placing = self._placing(scan, base_from_sensor, at)
-        if not self._searches:
+        if not self._searches and (self._lost is None or self._lost.ahead is None):
             left = placing.left_at(self._map_from_odom @ at @ base_from_sensor)
             base = None if left is None else left.pose @ base_from_sensor.inverse()
             if base is not None and self._join(sensor, scan, base_from_sensor, at, base):
@@ -386,17 +418,28 @@ class SlamLocaliser:
         return False
 
     def _is_within_reach(self, map_from_base: Pose2, at: Pose2) -> bool:
-        """Whether a robot that is there now can have come there from where it was lost, whichever way it was turned."""
-        if self._lost is None:
-            return True
-        then = map_from_base @ (at.inverse() @ self._lost.odom)
-        return math.hypot(then.x_m - self._lost.left.x_m, then.y_m - self._lost.left.y_m) <= self._lost.reach_m
+        """Whether a robot that is there now can have come there from where it was lost."""
+        return self._lost is None or self._lost.can_have_come(map_from_base, at, STRAYED * self._way_m)
 
     def _placing(self, scan: Scan, base_from_sensor: Pose2, at: Pose2) -> Placing:
         state = self._slam.state()
         told_at, bases = self._hypotheses
         among = tuple(base @ (told_at.inverse() @ at) @ base_from_sensor for base in bases) if len(bases) > 1 else ()
-        return Placing(state.views, state.poses, scan, among, self._slam.settings.farthest_m)
+        anywhere = Placing(state.views, state.poses, scan, among, self._slam.settings.farthest_m)
+        lost, strayed_m = self._lost, STRAYED * self._way_m
+        if lost is None:
+            return anywhere
+        way = lost.odom.inverse() @ at
+        ahead = (IDENTITY,) if lost.ahead is None else (IDENTITY, lost.ahead)
+        to_sensor_m = math.hypot(base_from_sensor.x_m, base_from_sensor.y_m)
+        radius_m = lost.reach_m + strayed_m + math.hypot(way.x_m, way.y_m) + to_sensor_m
+        return replace(
+            anywhere,
+            may_be=lambda pose: lost.can_have_come(pose @ base_from_sensor.inverse(), at, strayed_m),
+            near=(lost.left.x_m, lost.left.y_m, radius_m),
+            guesses=tuple(lost.left @ each @ way @ base_from_sensor for each in ahead),
+            least=LEFT_QUALITY,
+        )
 
     def _begin_search(self, placing: Placing, base_from_sensor: Pose2, at: Pose2) -> None:
         def work() -> tuple[Pose2, ...]:
@@ -473,6 +516,13 @@ class SlamLocaliser:
             if undone:
                 self._slam.settle()
                 self._begin_work()
+
+
+def _way_ahead(state: OdometryState, seconds: float) -> Pose2 | None:
+    """How far a robot comes that goes on like this; None if that is where it stands."""
+    if abs(state.forward_m_s) * seconds <= LEFT_M and abs(state.yaw_rad_s) * seconds <= LEFT_RAD:
+        return None
+    return exp_se2((state.forward_m_s * seconds, 0.0, state.yaw_rad_s * seconds))
 
 
 def _depths_or_none(swept: Scan, before: _Looked | None) -> Depths | None:

@@ -7,6 +7,7 @@ after the robot has moved on, it tells which of them still fit. One that is left
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +50,9 @@ class Place:
 class Placing:
     """A scan to be found among key scans, poses (K, 3) of the sensor.
 
-    among: places to choose from, empty for anywhere.
+    among: places to choose from, empty for anywhere.  may_be: whether the sensor can be at a pose; None: anywhere.
+    near: the middle and the radius of a circle that it is in, None: no bound.  guesses: where to look as well.
+    least: quality below which a place is none; new ground looks a little like much that is known.
     """
 
     views: ViewArrays
@@ -57,11 +60,15 @@ class Placing:
     scan: Scan
     among: tuple[Pose2, ...] = ()
     farthest_m: float = 30.0
+    may_be: Callable[[Pose2], bool] | None = None
+    near: tuple[float, float, float] | None = None
+    guesses: tuple[Pose2, ...] = ()
+    least: float = 0.0
 
     @property
     def cost(self) -> int:
         """How many places are looked at."""
-        return len(self.among) or len(self._spread())
+        return len(self.among) or len(self._spread()) + len(self.guesses)
 
     def left_at(self, pose: Pose2) -> Place | None:
         """Where the sensor was left, if the scan fits there, and there exactly; quick."""
@@ -74,12 +81,18 @@ class Placing:
         """Where the sensor may be, the best first; one place if that is clear, none if it fits nowhere."""
         view = view_of(self.scan, table_for(self.scan.bearing_rad), farthest_m=self.farthest_m)
         if self.among:
-            return _alike([self._fitting(view, pose) for pose in self.among])
+            return self._alike([self._fitting(view, pose) for pose in self.among])
         found: list[Place | None] = []
         for key in self._spread().tolist():
             x, y, yaw = self.poses[key].tolist()
             found += [self._searched(view, Pose2(x, y, yaw + turn), WINDOW_M, math.pi / 2.0) for turn in TURNS]
-        return _alike(found)
+        found += [self._searched(view, pose, WINDOW_M, math.pi / 2.0) for pose in self.guesses]
+        return self._alike(found)
+
+    def _alike(self, found: list[Place | None]) -> tuple[Place, ...]:
+        """Of those that can be: a rival where the robot cannot have come to is none."""
+        there = [each for each in found if each is not None and each.quality >= self.least]
+        return _alike([each for each in there if self.may_be is None or self.may_be(each.pose)])
 
     def _searched(self, view: View, near: Pose2, window_m: float, turn_rad: float) -> Place | None:
         """The best place around, if the scan really fits there."""
@@ -100,16 +113,20 @@ class Placing:
         """Key scans that lie apart and are near to all others."""
         chosen: list[int] = []
         for key in range(len(self.poses)):
+            if self.near is not None:
+                x_m, y_m, radius_m = self.near
+                if math.hypot(self.poses[key, 0] - x_m, self.poses[key, 1] - y_m) > radius_m + APART_M:
+                    continue
             off = self.poses[chosen, :2] - self.poses[key, :2]
             if not chosen or float(np.hypot(off[:, 0], off[:, 1]).min()) > APART_M:
                 chosen.append(key)
         return np.array(chosen, dtype=np.int64)
 
 
-def _alike(found: list[Place | None]) -> tuple[Place, ...]:
+def _alike(found: list[Place]) -> tuple[Place, ...]:
     """The best place and those that fit nearly as well, each once."""
     alike: list[Place] = []
-    for place in sorted((each for each in found if each is not None), key=lambda each: -each.quality):
+    for place in sorted(found, key=lambda each: -each.quality):
         if alike and place.quality < ALIKE * alike[0].quality:
             break
         if not any(_is_same(place.pose, other.pose) for other in alike):

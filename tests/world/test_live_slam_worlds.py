@@ -507,6 +507,57 @@ def test_a_laser_that_is_lost_on_the_way_harms_nothing(lost: str) -> None:
     assert np.quantile(errors, 0.95) < 0.10
 
 
+def without_wheels(driving: Drive, after_s: float, seconds: float) -> list[tuple[str, Reading]]:
+    """The drive, its wheels' cable pulled for a while: what they counted meanwhile nobody knows."""
+    first_ns, last_ns = round(after_s * 1e9), round((after_s + seconds) * 1e9)
+    items = [
+        (source, said) for source, said in driving.items if source != "base" or not first_ns <= said.stamp_ns < last_ns
+    ]
+    back = next(k for k, (source, said) in enumerate(items) if source == "base" and said.stamp_ns >= last_ns)
+    source, said = items[back]
+    assert isinstance(said, WheelReading)
+    items[back] = (source, replace(said, continuous=False))
+    return items
+
+
+@pytest.mark.parametrize(
+    ("name", "laps", "after_s", "gap_s", "found_s"),
+    [
+        ("flat", 1.0, 17.0, 0.3, 1.0),  # odometry is predicted so far: it goes on
+        ("office", 0.6, 17.14, 1.0, 5.0),
+        ("flat", 1.0, 17.0, 3.0, 10.0),
+        ("warehouse", 1.1, 104.0, 2.0, 10.0),
+        ("loop", 1.25, 29.0, 1.0, 60.0),  # round a corner into new ground: only when it comes round again
+    ],
+)
+def test_a_robot_whose_wheels_were_gone_looks_for_itself_before_it_draws(
+    name: str, laps: float, after_s: float, gap_s: float, found_s: float
+) -> None:
+    driving = drive(name, laps)
+    made = robot(driving.truth(0))
+    made.play(without_wheels(driving, after_s, gap_s))
+    walls = wall_errors_m(driving, made.grid.patch())
+    assert np.quantile(walls, 0.95) <= 0.08
+    back_ns = (after_s + gap_s) * 1e9
+    sure = [pose for pose in made.poses if pose.covariance[0, 0] < 1.0 and pose.stamp_ns > back_ns + 250 * MS]
+    assert sure[0].stamp_ns - back_ns < found_s * 1e9
+    assert pose_errors_m(driving, sure).max() < 0.15
+    assert made.fusion.troubles(0) == []
+
+
+def test_in_new_ground_nothing_is_drawn_after_a_gap_and_it_is_said() -> None:
+    driving = drive("loop", 1.25)
+    made = robot(driving.truth(0))
+    items = [item for item in without_wheels(driving, 29.0, 1.0) if item[1].stamp_ns < 50 * 1_000 * MS]
+    made.play([item for item in items if item[1].stamp_ns < 29 * 1_000 * MS])
+    before = robot(driving.truth(0))
+    before.play(items)
+    assert np.quantile(wall_errors_m(driving, before.grid.patch()), 0.95) <= 0.08
+    known = int((before.grid.patch().cells >= 0).sum())
+    assert known <= 1.01 * int((made.grid.patch().cells >= 0).sum())
+    assert "does not find itself" in before.fusion.troubles(0)[0]
+
+
 # --- going on in a stored map
 
 
