@@ -52,6 +52,7 @@ _LIFE_NS = 5 * _HEARTBEAT_MS * 1_000_000
 _SEARCH_PERIOD_NS = 250_000_000
 _REFUSED_RETRY_NS = 1_000_000_000
 _START_REPEAT_NS = 300_000_000
+_STARTS_UNTIL_TOLD = 3
 _SYNC_PATIENCE_NS = 1_000_000_000  # started, alive, but no TPDO2 for so long: this node does not know SYNC
 _TRIPS_KEPT = 15
 _SHORTEST_ANSWER_LIMIT_NS = 40_000_000  # later ones would be taken for answers to the next SYNC
@@ -171,6 +172,8 @@ class _Node:
         self._heard_ns = now_ns
         self._beats = False
         self._start_due_ns = _NEVER
+        self.starts_refused = 0  # one after the other, as its heartbeat tells
+        self._newest_error = 0
         self._sdo.cancel()
         self.unwrapper.restart()
 
@@ -187,6 +190,13 @@ class _Node:
             return f"{self.name} does not answer: check its power, the wiring and termination, node id and bit rate"
         if self.emergency is not None:
             return f"{self.name} reports error {self.emergency:04X}h: see its manual for this emergency code"
+        if self.starts_refused >= _STARTS_UNTIL_TOLD:
+            cause = (
+                f"its newest error is {self._newest_error:04X}h (1003h), see its manual"
+                if self._newest_error
+                else ("an error of its own, or another master of the bus, keeps it from starting")
+            )
+            return f"{self.name} does not become operational: {cause}"
         return None
 
     # ---- out
@@ -241,10 +251,16 @@ class _Node:
         state = data[0] & 0x7F
         if state == _BOOT_UP:
             self.booted(now_ns)
-        elif state != _OPERATIONAL and self._start_overdue(now_ns):
+        elif state == _OPERATIONAL:
+            self.starts_refused = 0
+        elif self._start_overdue(now_ns):
             self._counters.drop("not_operational")
             self._start_due_ns = now_ns
             self.unwrapper.restart()
+            self.starts_refused += 1
+            if self.starts_refused == _STARTS_UNTIL_TOLD and self._script is None:
+                self._script = self._ask_why()
+                self._sdo.ask(next(self._script), now_ns)
 
     def take_emergency(self, data: bytes) -> None:
         if len(data) != 8:
@@ -319,6 +335,11 @@ class _Node:
             self._sdo.ask(self._script.send(done), now_ns)
         except StopIteration:
             self._script = None
+
+    def _ask_why(self) -> Script:
+        """The newest error on its list: what it told when it happened, we may not have heard."""
+        done = yield Upload(0x1003, 1)
+        self._newest_error = done.number & 0xFFFF if done.ok else 0
 
     def _set_up(self) -> Script:
         """The questions and settings in order; each `yield` is one SDO transfer."""
@@ -720,8 +741,10 @@ class _Cia406Conversation(ABC):
         """Both nodes live and are started, but SYNC brings no pair of positions: read them by timer instead."""
         if self._cyclic or self._sampling != "auto":
             return
-        if self._deaf_since_ns is None:
-            self._deaf_since_ns = now_ns
+        if self._deaf_since_ns is None or any(node.starts_refused for node in self._nodes):
+            self._deaf_since_ns = (
+                now_ns  # who is not operational answers no SYNC, and would send nothing by timer either
+            )
         if self._running or now_ns - self._deaf_since_ns <= _SYNC_PATIENCE_NS:
             return
         self._cyclic = self._fallen_back = True

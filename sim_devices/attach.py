@@ -113,7 +113,12 @@ class TcpLink:
         return [end.fileno() for end in (self._listener, self._client) if end is not None]
 
     def read(self) -> bytes:
-        self._welcome()
+        data = self._received()  # before anybody is welcomed: a host that has hung up makes room for the next
+        if not data and self._welcomed():
+            data = self._received()
+        return data
+
+    def _received(self) -> bytes:
         if self._client is None:
             return b""
         try:
@@ -141,17 +146,21 @@ class TcpLink:
         self.counters.dropped_bytes += len(data) - sent
         return sent
 
-    def _welcome(self) -> None:
+    def _welcomed(self) -> bool:
+        """Whether a host has just been let in; while one is there, others are turned away."""
         if self._listener is None:
-            return
-        with contextlib.suppress(OSError):
+            return False
+        try:
             client, _ = self._listener.accept()
-            if self._client is not None:
-                client.close()
-                return
-            client.setblocking(False)
-            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._client = client
+        except OSError:
+            return False
+        if self._client is not None:
+            client.close()
+            return False
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client = client
+        return True
 
     def _lose_client(self) -> None:
         if self._client is not None:
@@ -335,6 +344,8 @@ class DeviceStation:
         lost = int(getattr(self.link, "hosts_lost", 0))
         if lost != self._hosts_lost:
             self._hosts_lost = lost
+            self.link.counters.dropped_bytes += len(self._owed)
+            self._owed = b""  # what waited for it is not for the next one
             tell = getattr(self.device, "link_lost", None)
             if tell is not None:
                 tell(now_ns)

@@ -12,9 +12,10 @@ fires its sending transducer only, and all four listen. Parameters written with 
 they stay; a new base id holds from the answer to the ninth part on. A board that is switched on is deaf for a while.
 
 Assumed, the papers being silent: the codes 0, 1, 2 (not connected, too close, no echo) hold in the one-byte format of
-V1 as well, and distances past 255 cm read 255 there; an inactive transducer reads as not connected; the CAN rate in the
-parameters is kept but changes nothing before a power cycle; a V1 board does not know command 13; a serial command that
-stops half-way for 50 ms is forgotten.
+V1 as well, and distances past 255 cm read 255 there; V1 sends all four groups by itself, whatever the mask in byte 6
+(the maker's node for it writes none and waits for all); an inactive transducer reads as not connected; the CAN rate in
+the parameters is kept but changes nothing before a power cycle; a V1 board does not know command 13; a serial command
+that stops half-way for 50 ms is forgotten.
 """
 
 from __future__ import annotations
@@ -190,7 +191,7 @@ class UsBoard:
         return out
 
     def _round_frames(self, now_ns: int) -> list[tuple[int, bytes]]:
-        groups = [g for g in range(4) if self.parameters[6] >> 4 + g & 1]
+        groups = [g for g in range(4) if self.is_v1 or self.parameters[6] >> 4 + g & 1]
         if not (self.is_v1 or self.parameters[5] & 8):
             return [(13 + g, self._group_frame(g, now_ns)) for g in groups]
         frames = [*self._short_frames(DATA_1TO8, now_ns), *self._short_frames(DATA_9TO16, now_ns)]

@@ -43,6 +43,7 @@ class ScriptedNode:
         self.powered = True
         self.knows_sync = True
         self.answers_sync = True
+        self.may_start = True
         self.timer_due_ns: int | None = None
         self.heartbeat_due_ns = 0
         self.objects: dict[tuple[int, int], bytes] = {
@@ -79,7 +80,8 @@ class ScriptedNode:
         sent: list[CanFrame] = []
         for frame in received:
             if frame.can_id == 0 and frame.data[1] in (0, self.node):
-                self.state = {1: 5, 2: 4, 0x80: 0x7F}.get(frame.data[0], self.state)
+                told = {1: 5, 2: 4, 0x80: 0x7F}.get(frame.data[0], self.state)
+                self.state = told if told != 5 or self.may_start else self.state
             elif frame.can_id == 0x80 and self._on_sync():
                 sent.append(CanFrame(0x280 + self.node, number(self.position, 4)))
             elif frame.can_id == 0x600 + self.node and self.state != 4:
@@ -639,6 +641,26 @@ def test_a_node_put_to_pre_operational_by_others_is_started_again() -> None:
     bench.run(400)
     assert bench.nodes[0].state == 5
     assert bench.drops["not_operational"] == 1
+
+
+@pytest.mark.parametrize(("listed", "told"), [(0x5000, "newest error is 5000h"), (None, "keeps it from starting")])
+def test_a_node_that_does_not_start_is_named_and_then_read_by_sync_all_the_same(listed: int | None, told: str) -> None:
+    """CANopenNode holds a device back for as long as its error register is not empty."""
+    bench = Bench()
+    held = bench.nodes[1]
+    held.may_start = False
+    if listed is not None:
+        held.objects[0x1003, 1] = number(0x14 << 16 | listed, 4)
+    assert bench.run(3000) == []
+    assert bench.state() is LinkState.STARTING
+    assert "node 21h (right wheel) does not become operational" in (bench.pair.trouble or "")
+    assert told in (bench.pair.trouble or "")
+    assert "TPDO2" not in (bench.pair.trouble or "")
+    held.may_start = True
+    bench.run(700)
+    assert len(bench.run(1000)) == 100
+    assert bench.pair.trouble is None
+    assert (held.objects[0x1800, 5], held.objects[0x1801, 2]) == (number(0, 2), b"\1"), "not by timer"
 
 
 def test_lost_answers_cost_their_reading_only() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import serial
 
-from sim_devices.attach import Attachment, MemoryLink, TcpLink
+from sim_devices.attach import Attachment, DeviceStation, MemoryLink, TcpLink
 from sim_devices.pty_link import PtyLink
 from tests.waiting import GIVE_UP_S, SteadyClock, wait_for, wait_for_input
 
@@ -250,6 +250,44 @@ def test_tcp_serves_one_host_at_a_time_and_tells_the_device_when_it_goes() -> No
         with socket.create_connection((link.host, link.port), GIVE_UP_S) as host:
             host.sendall(b"x")
             assert host.recv(1) == b"X"
+
+
+def test_tcp_host_that_calls_behind_one_that_has_hung_up_is_served() -> None:
+    """Both are waiting when the device comes to look, as when a program is run again at once."""
+    link, device = TcpLink(port=0), Upper()
+    loop = Attachment()
+    loop.add("device", device, link)
+
+    def call(text: bytes) -> socket.socket:
+        host = socket.create_connection((link.host, link.port), GIVE_UP_S)
+        host.sendall(text)
+        return host
+
+    with call(b"first"):
+        loop.service(0)
+    with call(b"second") as second:
+        for _ in range(3):
+            loop.service(0)
+        assert second.recv(10) == b"SECOND"
+        assert device.lost == 1
+    loop.stop()
+
+
+def test_what_waited_for_a_tcp_host_is_not_given_to_the_next_one() -> None:
+    link, device = TcpLink(port=0), Upper()
+    station = DeviceStation(device, link)
+    with socket.create_connection((link.host, link.port), GIVE_UP_S):
+        station.service(0)
+        lost = b"x" * 10_000_000  # more than any socket holds
+        station._hand_over(lost, 0)
+        station.service(0)
+    with socket.create_connection((link.host, link.port), GIVE_UP_S) as host:
+        host.sendall(b"mine")
+        for _ in range(3):
+            station.service(0)
+        assert host.recv(100) == b"MINE"
+        assert device.lost == 1
+    station.close()
 
 
 # -- the loop ---------------------------------------------------------------------------------------------------------

@@ -186,6 +186,13 @@ def test_v1_board_knows_only_short_data() -> None:
     assert one.ask(bytes((2,)))[0] == (0x402, "02001E0000000000")
 
 
+def test_v1_board_sends_all_four_groups_whatever_the_mask_of_newer_boards() -> None:
+    """The maker's node for it (neo_usboard, on CAN) writes 1, "on CAN", into byte 6 and waits for all four messages."""
+    one = OnCan(board({1: 0.3, 16: 0.5}, changed(default_parameters(hardware=0), 6, 0x01)))
+    one.now_ns += 600 * MS
+    assert [frame.can_id for frame in one.can.step(one.now_ns, [])] == [0x402, 0x403, 0x404, 0x405]
+
+
 def test_board_is_deaf_while_it_boots() -> None:
     can = UsBoardCan(board({}))
     assert can.step(5 * SECOND, [Frame(0x400, b"\0")]) == []
