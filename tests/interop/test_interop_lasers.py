@@ -49,9 +49,9 @@ from sim_devices.laser_sick_cola import COLA_PROFILES, SickColaLaser
 from sim_devices.laser_sick_lms2xx import SickLms2xxLaser
 from sim_devices.pty_link import PtyLink
 
-NOISE_M = (
-    0.02  # mean error of a reader that reads right: the lasers' noise, and angles rounded to an eighth of a degree
-)
+# Mean error of a reader that reads right: 0.0197 m, the lasers' noise and angles rounded to an eighth of a degree; of
+# one turn of 286 samples it scatters by 0.0008 m. Half a degree off would be 0.025 m.
+NOISE_M = 0.023
 
 
 class Room:
