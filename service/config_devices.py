@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from service.config_base import Name, Point, Positive, Section
+from service.config_base import Direction, Heard, Name, Opening, Place, Point, Positive, Section, Track, Wheel
 
 SERIAL_NUMBER = "serial:"
 """What a port begins with that is a device's serial number: where it is plugged in is found out when it is opened."""
@@ -55,9 +55,9 @@ class Drive(Section):
         default=True,
         description="Without source and pose_source: the sweeps of the first level laser are the odometry.",
     )
-    wheel_radius_left_m: Positive = Field(default=0.10, description="Rolling radius of the left wheel.")
-    wheel_radius_right_m: Positive = Field(default=0.10, description="Rolling radius of the right wheel.")
-    track_width_m: Positive = Field(default=0.50, description="Distance between the wheels' contact points.")
+    wheel_radius_left_m: Wheel = Field(default=0.10, description="Rolling radius of the left wheel.")
+    wheel_radius_right_m: Wheel = Field(default=0.10, description="Rolling radius of the right wheel.")
+    track_width_m: Track = Field(default=0.50, description="Distance between the wheels' contact points.")
     ticks_per_turn_left: float = Field(
         default=4096.0,
         description="Counts per turn of the left wheel, gear included; negative if they fall rolling forward.",
@@ -93,12 +93,10 @@ class Drive(Section):
 class Mount(Section):
     """Where a sensor sits, in the base frame."""
 
-    x_m: float = Field(default=0.0, description="Forward of the base's origin.")
-    y_m: float = Field(default=0.0, description="Left of the base's origin.")
-    z_m: float = Field(default=0.0, description="Above the ground.")
-    yaw_deg: float = Field(
-        default=0.0, ge=-360, le=360, description="Direction it looks in, counter-clockwise from forward."
-    )
+    x_m: Place = Field(default=0.0, description="Forward of the base's origin.")
+    y_m: Place = Field(default=0.0, description="Left of the base's origin.")
+    z_m: Place = Field(default=0.0, description="Above the ground.")
+    yaw_deg: Direction = Field(default=0.0, description="Direction it looks in, counter-clockwise from forward.")
     upside_down: bool = Field(default=False, description="Mounted head down: its bearings count the other way.")
 
 
@@ -313,10 +311,10 @@ class Transducer(Section):
     """One transducer of an ultrasonic chain."""
 
     channel: int = Field(ge=1, le=64, description="Number printed on the board, from 1.")
-    x_m: float = Field(default=0.0, description="Forward of the base's origin.")
-    y_m: float = Field(default=0.0, description="Left of the base's origin.")
-    z_m: float = Field(default=0.0, description="Above the ground.")
-    yaw_deg: float = Field(default=0.0, ge=-360, le=360, description="Direction it looks in.")
+    x_m: Place = Field(default=0.0, description="Forward of the base's origin.")
+    y_m: Place = Field(default=0.0, description="Left of the base's origin.")
+    z_m: Place = Field(default=0.0, description="Above the ground.")
+    yaw_deg: Direction = Field(default=0.0, description="Direction it looks in.")
 
 
 class _UsBoard(Device):
@@ -327,9 +325,9 @@ class _UsBoard(Device):
         description="Who sets the pace. auto: as the board is set; request: we ask; listen: it sends by itself.",
     )
     rate_hz: float = Field(default=10.0, gt=0, le=25, description="Rounds a second.")
-    cone_deg: float = Field(default=30.0, gt=0, le=120, description="Full opening angle of a transducer.")
+    cone_deg: Opening = Field(default=30.0, description="Full opening angle of a transducer.")
     range_min_m: float = Field(default=0.2, ge=0, description="Nearest distance a transducer measures.")
-    range_max_m: Positive = Field(default=3.0, description="Farther echoes count as nothing seen.")
+    range_max_m: Heard = Field(default=3.0, description="Farther echoes count as nothing seen.")
     transducers: tuple[Transducer, ...] = Field(default=(), max_length=16, description="The connected ones.")
 
     @model_validator(mode="after")
@@ -366,9 +364,9 @@ class UsBoardSerialSonars(_UsBoard):
 class _PlainSonars(Device):
     """Sonars without a board of their own."""
 
-    cone_deg: float = Field(default=30.0, gt=0, le=120, description="Full opening angle of a transducer.")
+    cone_deg: Opening = Field(default=30.0, description="Full opening angle of a transducer.")
     range_min_m: float = Field(default=0.02, ge=0, description="Nearest distance a transducer measures.")
-    range_max_m: Positive = Field(default=3.0, description="Farther echoes count as nothing seen.")
+    range_max_m: Heard = Field(default=3.0, description="Farther echoes count as nothing seen.")
     transducers: tuple[Transducer, ...] = Field(default=(), max_length=64, description="The connected ones.")
 
     @model_validator(mode="after")
@@ -485,12 +483,12 @@ class Cia406Wheels(Device):
 class Arm(Section):
     """Where a laser sits on its mount, seen from the axle, when the mount's angle is 0."""
 
-    x_m: float = Field(default=0.0, description="Forward of the axle.")
-    y_m: float = Field(default=0.0, description="Left of the axle.")
-    z_m: float = Field(default=0.0, description="Above the axle.")
-    roll_deg: float = Field(default=0.0, ge=-360, le=360, description="Turned about its forward axis; 90: on its side.")
-    pitch_deg: float = Field(default=0.0, ge=-360, le=360, description="Then about the left axis; positive looks down.")
-    yaw_deg: float = Field(default=0.0, ge=-360, le=360, description="Then about the vertical.")
+    x_m: Place = Field(default=0.0, description="Forward of the axle.")
+    y_m: Place = Field(default=0.0, description="Left of the axle.")
+    z_m: Place = Field(default=0.0, description="Above the axle.")
+    roll_deg: Direction = Field(default=0.0, description="Turned about its forward axis; 90: on its side.")
+    pitch_deg: Direction = Field(default=0.0, description="Then about the left axis; positive looks down.")
+    yaw_deg: Direction = Field(default=0.0, description="Then about the vertical.")
 
 
 class Cia406Mount(Device):
@@ -642,9 +640,9 @@ class Switch(Section):
         description="Level of the line when it touches (or sees no floor). high: a switch that opens, with a pull-up, "
         "so that a broken wire counts as touched.",
     )
-    x_m: float = Field(default=0.0, description="Middle of what it covers, forward of the base's origin.")
-    y_m: float = Field(default=0.0, description="Left of the base's origin.")
-    yaw_deg: float = Field(default=0.0, ge=-360, le=360, description="Direction it faces.")
+    x_m: Place = Field(default=0.0, description="Middle of what it covers, forward of the base's origin.")
+    y_m: Place = Field(default=0.0, description="Left of the base's origin.")
+    yaw_deg: Direction = Field(default=0.0, description="Direction it faces.")
     width_m: float = Field(default=0.2, gt=0, le=10, description="How wide it is.")
 
 

@@ -135,3 +135,48 @@ def test_what_cannot_be_is_told(tmp_path: Path, text: str, fault: str) -> None:
     with pytest.raises(WrongUsage) as refused:
         config(tmp_path, text)
     assert fault in str(refused.value)
+
+
+UNITS = """
+[robot]
+footprint_m = [[0.45, 0.3], [-0.45, 0.3], [-0.45, -0.3], [0.45, -0.3]]
+[drive]
+source = "drive"
+wheel_radius_left_m = 0.1
+track_width_m = 0.5
+[wheels.drive]
+driver = "arduino-bridge"
+port = "/dev/board"
+[sonars.front]
+driver = "arduino-bridge"
+port = "/dev/board"
+cone_deg = 30.0
+range_max_m = 3.5
+transducers = [{ channel = 7, x_m = 0.2, yaw_deg = 90.0 }]
+"""
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "told"),
+    [
+        ("[0.45, 0.3], [-0.45", "[45, 0.3], [-0.45", r"footprint_m\[0\]\[0\]: is 45 metres; write 0.45 or 0.045"),
+        (
+            "left_m = 0.1",
+            "left_m = 100",
+            "wheel_radius_left_m: is 100 metres; write 1 or 0.1 if centimetres or millimetres",
+        ),
+        ("width_m = 0.5", "width_m = 50", "track_width_m: is 50 metres; write 0.5"),
+        ("cone_deg = 30.0", "cone_deg = 0.5236", "cone_deg: is 0.5236 degrees; write 30 if radians were meant"),
+        ("range_max_m = 3.5", "range_max_m = 350", "range_max_m: is 350 metres; write 3.5"),
+        ("x_m = 0.2", "x_m = 200", "x_m: is 200 metres; write 2 or 0.2"),
+        ("yaw_deg = 90.0", "yaw_deg = 1.5708", "yaw_deg: is 1.5708 degrees; write 90 if radians were meant"),
+        ("yaw_deg = 90.0", "yaw_deg = -3.14159", "yaw_deg: is -3.14159 degrees; write -180 if radians were meant"),
+    ],
+)
+def test_units_that_were_mistaken_are_told_with_what_was_meant(
+    tmp_path: Path, right: str, wrong: str, told: str
+) -> None:
+    config(tmp_path, UNITS)
+    assert right in UNITS
+    with pytest.raises(WrongUsage, match=told):
+        config(tmp_path, UNITS.replace(right, wrong))
