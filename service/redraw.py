@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.frames import Pose2, wrap_angles
+from mapping.frames import Pose2, wrap_angle
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.tiles import TILE
 from mapping.localise.kept_places import KeptPlaces, profile_of
@@ -50,6 +50,7 @@ DELAY_NS = 500_000_000
 DELAY_NS_PER_KEPT = 2_000_000  # about ten times what one takes to draw thrice
 TOUCH_REACH_M = 3.0  # a switch sits on the robot
 GIVE_UP_AT_ONCE = 64  # so many may go before anything does: the rest is moved together each time
+_NO_CHANNELS: frozenset[int] = frozenset()
 RECENT = 40  # kept sweeps that make up what is around the robot
 
 
@@ -162,7 +163,7 @@ class Redrawer:
         self._in_key: F64 = np.zeros((64, 2, 3))
         self._drawn: F64 = np.zeros((64, 2, 3))
         self._reach: F64 = np.zeros(64)
-        self._last: dict[str, F64] = {}
+        self._last: dict[tuple[str, frozenset[int]], Pose2] = {}
         self._bearings: dict[str, NDArray[np.float32]] = {}
         self._under_way: _UnderWay | None = None
         self._base: dict[Place, bytes] = {}
@@ -173,7 +174,7 @@ class Redrawer:
 
     def keep_sweep(self, source: str, scan: Scan, key: int, key_pose: Pose2, ends: F64) -> None:
         """A sweep that is drawn now: ends (2, 3) base poses at its first and last beam, in the map."""
-        if source in self._mounts and self._has_moved(source, ends[0], frozenset()):
+        if source in self._mounts and self._has_moved(source, Pose2(*ends[0].tolist()), _NO_CHANNELS):
             sweep = kept_sweep(
                 source, scan, key=key, in_key=_seen_from(key_pose, ends), known_bearing_rad=self._bearings.get(source)
             )
@@ -182,18 +183,17 @@ class Redrawer:
 
     def keep_round(self, source: str, heard: Round, key: int, key_pose: Pose2, map_from_base: Pose2) -> None:
         """The same for sonars."""
-        ends = np.array([[map_from_base.x_m, map_from_base.y_m, map_from_base.yaw_rad]] * 2)
-        if self._has_moved(source, ends[0], frozenset(cone.channel for cone in heard.cones)):
+        if self._has_moved(source, map_from_base, frozenset(cone.channel for cone in heard.cones)):
+            ends = _at_both_ends(map_from_base)
             self._keep(KeptRound(source, key, _seen_from(key_pose, ends), heard), ends)
 
-    def _has_moved(self, source: str, pose: F64, channels: frozenset[int]) -> bool:
-        name = f"{source}/{sorted(channels)}" if channels else source
-        last = self._last.get(name)
+    def _has_moved(self, source: str, pose: Pose2, channels: frozenset[int]) -> bool:
+        last = self._last.get((source, channels))
         if last is not None:
-            off = pose - last
-            if math.hypot(off[0], off[1]) < STEP_M and abs(wrap_angles(off[2:])[0]) < STEP_RAD:
+            way_m = math.hypot(pose.x_m - last.x_m, pose.y_m - last.y_m)
+            if way_m < STEP_M and abs(wrap_angle(pose.yaw_rad - last.yaw_rad)) < STEP_RAD:
                 return False
-        self._last[name] = pose.copy()
+        self._last[source, channels] = pose
         return True
 
     def _keep(self, kept: Kept, ends: F64) -> None:
@@ -232,8 +232,8 @@ class Redrawer:
 
     def keep_touch(self, source: str, touch: Touch, key: int, key_pose: Pose2, map_from_base: Pose2) -> None:
         """The same for a switch that is tripped."""
-        ends = np.array([[map_from_base.x_m, map_from_base.y_m, map_from_base.yaw_rad]] * 2)
-        if self._has_moved(source, ends[0], frozenset([touch.switch.line])):
+        if self._has_moved(source, map_from_base, frozenset([touch.switch.line])):
+            ends = _at_both_ends(map_from_base)
             self._keep(KeptRound(source, key, _seen_from(key_pose, ends), touch), ends)
 
     def start_over(self, base: Iterable[tuple[int, int, bytes]] = ()) -> None:
@@ -413,6 +413,11 @@ def _seen_from(key_pose: Pose2, ends: F64) -> F64:
 
 def _inverse_of(pose: F64) -> F64:
     return _row(Pose2(*pose.tolist()).inverse())[None, :]
+
+
+def _at_both_ends(pose: Pose2) -> F64:
+    """(2, 3) of what was heard at one instant."""
+    return np.array([[pose.x_m, pose.y_m, pose.yaw_rad]] * 2)
 
 
 def _row(pose: Pose2) -> F64:

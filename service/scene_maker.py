@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -26,9 +27,21 @@ _NEWEST_MAX: Final = 200  # scenes that the document lists one by one
 _HEAD_TILE: Final = (0, 0)  # how many scenes there are; scene n is tile (n, 1)
 
 
+@dataclass(frozen=True, slots=True)
+class _Swept:
+    """A sweep and the poses of its beams, (N, 3) or (1, 3), as it came. middle: the pose from which it is looked at."""
+
+    scan: Scan
+    poses: F64
+    middle: Pose2
+
+
 class SceneMaker:
     """A SceneDatabase as a map maker: a sweep becomes a scene where the laser has come to a new place, and the newest
-    sweeps of each laser are kept to answer where the robot is."""
+    sweeps of each laser are kept to answer where the robot is.
+
+    A sweep is looked at where the robot has moved, and the newest one when somebody asks: most are replaced unseen.
+    """
 
     def __init__(
         self,
@@ -49,6 +62,7 @@ class SceneMaker:
         self.database = SceneDatabase(most=most)
         self._last: dict[str, Pose2] = {}
         self._stretches: dict[str, Stretch] = {}
+        self._unseen: dict[str, _Swept] = {}  # the newest sweeps that nobody has looked at, the newest last
         self._newest_source = ""
         self._version, self._told_version = 0, 0
         self._kept, self._kept_version = 0, 0
@@ -64,20 +78,37 @@ class SceneMaker:
         middle = Pose2(*(float(v) for v in poses[len(poses) // 2]))
         if not np.all(np.isfinite(poses)) or len(scan.bearing_rad) < 3:
             return
-        still = scan if len(poses) == 1 else _as_seen_from(middle, scan, poses)
-        if still is None or not are_in_order(still.bearing_rad):  # kept in few bits, or turned fast
+        self._unseen.pop(source, None)
+        self._unseen[source] = _Swept(scan, poses, middle)
+        is_new_place = self._has_moved(source, middle) and not self.database.covers(middle)
+        stretch = self._stretches.get(source)
+        if not is_new_place and stretch is not None and not stretch.would_keep(middle):
             return
-        self._stretches.setdefault(source, Stretch()).take(still, middle)
+        still = self._look(source)
+        if still is None or not is_new_place:
+            return
+        self._last[source] = middle
+        sight = sight_of(still)
+        if len(sight.graph) == 0:
+            return
+        if self.database.add(sight, middle) is None:
+            self._left_out += 1
+        else:
+            self._version += 1
+
+    def _look(self, source: str) -> Scan | None:
+        """The newest sweep of a laser as seen from one pose, kept from now on; None if it can tell nothing."""
+        swept = self._unseen.pop(source)
+        still = swept.scan if len(swept.poses) == 1 else _as_seen_from(swept.middle, swept.scan, swept.poses)
+        if still is None or not are_in_order(still.bearing_rad):  # kept in few bits, or turned fast
+            return None
+        self._stretches.setdefault(source, Stretch()).take(still, swept.middle)
         self._newest_source = source
-        if self._has_moved(source, middle) and not self.database.covers(middle):
-            self._last[source] = middle
-            sight = sight_of(still)
-            if len(sight.graph) == 0:
-                return
-            if self.database.add(sight, middle) is None:
-                self._left_out += 1
-            else:
-                self._version += 1
+        return still
+
+    def _look_at_newest(self) -> None:
+        for source in list(self._unseen):
+            self._look(source)
 
     def make(self, view: MapView) -> list[Output]:
         """The summary, if a scene has come or gone since it was last told."""
@@ -93,6 +124,7 @@ class SceneMaker:
         count (SKIP_NEWEST), as a robot that was carried away has just put them at wrong poses.
         CallRefused if there is no such laser, or none has been heard yet.
         """
+        self._look_at_newest()
         skip = arguments.get("skip_newest", SKIP_NEWEST)
         if not isinstance(skip, int) or isinstance(skip, bool) or skip < 0:
             raise CallRefused(f"skip_newest is a number of scenes, 0 or more, not {skip!r}")
@@ -136,6 +168,7 @@ class SceneMaker:
         """Forget the scenes: the map was corrected or replaced. The newest sweeps stay, they say what is seen now."""
         self.database = SceneDatabase(self.database.rules, most=self.database.most)
         self._last.clear()
+        self._look_at_newest()
         for stretch in self._stretches.values():
             stretch.begin_anew()
         self._kept, self._left_out = 0, 0

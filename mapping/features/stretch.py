@@ -52,6 +52,10 @@ class Stretch:
         self._newest: _Kept | None = None
         self._kept: deque[_Kept] = deque(maxlen=MOST)
 
+    def would_keep(self, pose: Pose2) -> bool:
+        """Whether a sweep from there would be kept beyond the next one: others need not be taken to know the way."""
+        return not self._kept or _moved(self._kept[-1].pose, pose)
+
     def take(self, scan: Scan, pose: Pose2) -> None:
         """The next sweep. pose: the sensor's by odometry, or in any frame that moves as evenly."""
         last = self._newest
@@ -62,7 +66,7 @@ class Stretch:
                 self._kept.clear()
             way_m = last.way_m + step_m
         self._newest = _Kept(scan, way_m, pose)
-        if not self._kept or _moved(self._kept[-1].pose, pose):
+        if self.would_keep(pose):
             self._kept.append(self._newest)
 
     def begin_anew(self) -> None:

@@ -172,9 +172,10 @@ def _sorted_fan(beams: Beams, origin_m: F64, spread_m: float, fill_gap_m: float)
 
 def _wedges_between(gap_rad: F64, adjacent: Bools, fill_gap_m: float) -> F64:
     """As _wedges, where beams are neighbours only if they also were measured one after the other."""
-    between = np.sort(gap_rad[adjacent])
+    between = gap_rad[adjacent]
     if between.size == 0:
         return np.zeros(gap_rad.size)
-    nominal = float(between[between.size // 2])
+    middle = between.size // 2
+    nominal = float(np.partition(between, middle)[middle])
     neighbours = adjacent & (gap_rad <= min(NEIGHBOUR_FACTOR * nominal, MAX_WEDGE_RAD))
     return np.where(neighbours, fill_gap_m / np.maximum(gap_rad, 1e-9), 0.0)

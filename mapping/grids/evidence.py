@@ -17,7 +17,7 @@ from mapping.frames import Pose2
 from mapping.grids.beam_model import Beams, BeamTable, Fan, beam_table, fan_of_beams
 from mapping.grids.geometry import cell_of, cells_of, check_resolution
 from mapping.grids.patch import GridPatch
-from mapping.grids.sonar_model import SonarMemory, SonarRules, cone_of_reading, guard_rows
+from mapping.grids.sonar_model import SonarMemory, SonarRules, cone_of_reading
 from mapping.grids.tiles import TILE, TO_PUBLISH, TilePool, Window
 from mapping.kernels import grids as kernels
 from mapping.kernels import sonar_cones
@@ -152,7 +152,8 @@ class EvidenceGrid:
         self._sonar_probability = _probabilities_of_sonar()
         self._sonar_percent = _percent(self._sonar_probability)
         self._sonar_rules = sonar_rules
-        self._sonar = SonarMemory(sonar_rules)
+        self._sonar = SonarMemory(sonar_rules, resolution_m)
+        self._sonar_weights: dict[float, F64] = {}
         self._tables: OrderedDict[int, BeamTable] = OrderedDict()
         self._work = _Work()
 
@@ -325,36 +326,38 @@ class EvidenceGrid:
         )  # fmt: skip
         if cone is None:
             return True
-        guards = guard_rows(self._sonar.guards(transducer), self.resolution_m)
+        guards = self._sonar.guards(transducer)
         self._sonar.remember(transducer, cone)
-        d, rules = self.resolution_m, self._sonar_rules
-        window = self._window_around(ox, oy, (range_max_m + cone.arc_half_m + rules.explain_m) / d)
+        d, explain_m = self.resolution_m, self._sonar_rules.explain_m
+        window = self._window_around(ox, oy, (range_max_m + cone.arc_half_m + explain_m) / d)
         if window is None:
             return True
         pool = self._pool
         pool.need_sonar()
-        step = sonar_cones.SONAR_STEP
-        weights = np.array(
-            [
-                rules.occupied_log_odds / step,
-                rules.edge_share,
-                cone.free_log_odds / step,
-                rules.lowest_log_odds / step,
-                rules.highest_log_odds / step,
-            ]
-        )
-        if cone.arc_m >= 0.0 and sonar_cones.echo_explained(
-            ox, oy, cone.axis_x, cone.axis_y, cone.cos_half, cone.arc_m / d, (cone.arc_half_m + rules.explain_m) / d,
-            window, pool.tile_row0, pool.tile_col0, pool.cells, self._laser_percent,
-            math.ceil(100.0 * self.rules.occupied_from), pool.index,
-        ):  # fmt: skip
-            weights[0] = 0.0  # the arc's other cells have no claim to be where this echo came from
-        sonar_cones.insert_cone(
+        sonar_cones.insert_reading(
             ox, oy, cone.axis_x, cone.axis_y, cone.cos_half, cone.arc_m / d, cone.arc_half_m / d,
-            cone.free_from_m / d, cone.free_m / d, weights, guards, window, pool.tile_row0, pool.tile_col0, pool.sonar,
-            pool.sonar_seen, pool.index, pool.tile_at, pool.free_slots, pool.flags, pool.state,
+            (cone.arc_half_m + explain_m) / d, cone.free_from_m / d, cone.free_m / d,
+            self._weights_of(cone.free_log_odds), guards, window, pool.tile_row0, pool.tile_col0, pool.cells,
+            self._laser_percent, math.ceil(100.0 * self.rules.occupied_from), pool.sonar, pool.sonar_seen, pool.index,
+            pool.tile_at, pool.free_slots, pool.flags, pool.state,
         )  # fmt: skip
         return True
+
+    def _weights_of(self, free_log_odds: float) -> F64:
+        """What the kernel weighs a cone's evidence by."""
+        weights = self._sonar_weights.get(free_log_odds)
+        if weights is None:
+            rules, step = self._sonar_rules, sonar_cones.SONAR_STEP
+            weights = self._sonar_weights[free_log_odds] = np.array(
+                [
+                    rules.occupied_log_odds / step,
+                    rules.edge_share,
+                    free_log_odds / step,
+                    rules.lowest_log_odds / step,
+                    rules.highest_log_odds / step,
+                ]
+            )
+        return weights
 
     def decay(self) -> None:
         """Forget half of all evidence, for maps that should follow a changing world even where nobody looks.

@@ -123,12 +123,15 @@ class Cone:
 
 
 class SonarMemory:
-    """All transducers of a robot: their filters, and their latest arcs as guards for each other."""
+    """All transducers of a robot: their filters, and their latest arcs as guards for each other, in cells."""
 
-    def __init__(self, rules: SonarRules) -> None:
+    def __init__(self, rules: SonarRules, resolution_m: float) -> None:
         self._rules = rules
+        self._resolution_m = resolution_m
         self._filters: dict[Hashable, EchoFilter] = {}
-        self._arcs: dict[Hashable, tuple[int, Cone]] = {}
+        self._arcs: dict[Hashable, tuple[int, int]] = {}  # of each transducer: when it was heard, and its row
+        self._rows: F64 = np.zeros((16, 7))
+        self._row_of: dict[Hashable, int] = {}
         self._count = 0
         self.rejected = 0
 
@@ -144,19 +147,27 @@ class SonarMemory:
         self.rejected += not believed
         return believed
 
-    def guards(self, transducer: Hashable | None) -> list[Cone]:
-        """Latest arcs of the other transducers."""
+    def guards(self, transducer: Hashable | None) -> F64:
+        """(K, 7) latest arcs of the other transducers, as the kernel takes them."""
         fresh = self._count - GUARD_READINGS
-        return [cone for name, (at, cone) in self._arcs.items() if name != transducer and at > fresh]
+        rows = [row for name, (at, row) in self._arcs.items() if at > fresh and name != transducer]
+        return self._rows[rows]
 
     def remember(self, transducer: Hashable | None, cone: Cone) -> None:
         """A believed reading replaces the transducer's arc; with no echo it takes it away."""
         if transducer is None:
             return
-        if cone.arc_m >= 0.0:
-            self._arcs[transducer] = (self._count, cone)
-        else:
+        if cone.arc_m < 0.0:
             self._arcs.pop(transducer, None)
+            return
+        row = self._row_of.setdefault(transducer, len(self._row_of))
+        if row == len(self._rows):
+            self._rows = np.concatenate((self._rows, np.zeros_like(self._rows)))
+        d = self._resolution_m
+        self._rows[row] = (
+            cone.x_m / d, cone.y_m / d, cone.axis_x, cone.axis_y, cone.cos_half, cone.arc_m / d, cone.arc_half_m / d,
+        )  # fmt: skip
+        self._arcs[transducer] = (self._count, row)
 
 
 def cone_of_reading(
@@ -201,12 +212,3 @@ def cone_of_reading(
         free_m=free,
         free_log_odds=weight,
     )
-
-
-def guard_rows(cones: list[Cone], resolution_m: float) -> F64:
-    """(K, 7) guards as the kernel takes them, in cells."""
-    rows = np.zeros((len(cones), 7))
-    for k, c in enumerate(cones):
-        d = resolution_m
-        rows[k] = (c.x_m / d, c.y_m / d, c.axis_x, c.axis_y, c.cos_half, c.arc_m / d, c.arc_half_m / d)
-    return rows

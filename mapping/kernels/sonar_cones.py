@@ -112,6 +112,30 @@ def echo_explained(
 
 
 @njit(cache=True, nogil=True)
+def insert_reading(
+    ox: float, oy: float, axis_x: float, axis_y: float, cos_half: float, arc_len: float, arc_half: float,
+    explain: float, free_from: float, free_len: float, weights: Any, guards: Any, window: Any, tile_row0: int,
+    tile_col0: int, laser_cells: Any, laser_percent: Any, laser_occupied: int, cells: Any, sonar_seen: Any, index: Any,
+    tile_at: Any, free_slots: Any, flags: Any, state: Any,
+) -> None:  # fmt: skip
+    """As insert_cone, where an echo that the laser explains (echo_explained, with the tolerance `explain`) puts up no
+    obstacle: the arc's other cells have no claim to be where it came from.
+
+    laser_cells, laser_percent, laser_occupied: as in echo_explained. The other arguments are those of insert_cone.
+    """
+    if arc_len >= 0.0 and echo_explained(
+        ox, oy, axis_x, axis_y, cos_half, arc_len, explain, window, tile_row0, tile_col0, laser_cells, laser_percent,
+        laser_occupied, index,
+    ):  # fmt: skip
+        weights = weights.copy()
+        weights[0] = 0.0
+    insert_cone(
+        ox, oy, axis_x, axis_y, cos_half, arc_len, arc_half, free_from, free_len, weights, guards, window, tile_row0,
+        tile_col0, cells, sonar_seen, index, tile_at, free_slots, flags, state,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
 def halve_sonar(cells: Any, start: int, stop: int) -> None:
     """Forget half of the evidence; a cell with nothing left becomes unknown."""
     for at in range(np.uint64(start), np.uint64(stop)):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -261,18 +261,23 @@ def rows_of_ends(start_m: F64, end_m: F64, count: F64, seen: F64, rms_m: F64) ->
 
 def cells_along(row: F64, margin_m: float) -> list[Cell]:
     """The index cells within margin_m of a line: its columns of cells, in each the rows between which it passes."""
-    x0, y0, x1, y1 = (float(v) for v in row[: kernels.WEIGHT])
+    x0, y0, x1, y1 = row[: kernels.WEIGHT].tolist()
     if x0 > x1:
         x0, y0, x1, y1 = x1, y1, x0, y0
     slope = (y1 - y0) / (x1 - x0) if x1 > x0 else 0.0
     cells: list[Cell] = []
     for column in _span(x0 - margin_m, x1 + margin_m):
-        left = min(max(column * CELL_M - margin_m, x0), x1)
-        right = min(max((column + 1) * CELL_M + margin_m, x0), x1)
-        a, b = (y0 + slope * (left - x0), y0 + slope * (right - x0)) if x1 > x0 else (y0, y1)
-        cells += [(column, at) for at in _span(min(a, b) - margin_m, max(a, b) + margin_m)]
+        a, b = y0, y1
+        if x1 > x0:
+            left = column * CELL_M - margin_m
+            right = (column + 1) * CELL_M + margin_m
+            a = y0 + slope * ((left if left > x0 else x0) - x0)
+            b = y0 + slope * ((right if right < x1 else x1) - x0)
+        if a > b:
+            a, b = b, a
+        cells += [(column, at) for at in _span(a - margin_m, b + margin_m)]
     return cells
 
 
-def _span(low: float, high: float) -> Iterable[int]:
+def _span(low: float, high: float) -> range:
     return range(math.floor(low / CELL_M), math.floor(high / CELL_M) + 1)

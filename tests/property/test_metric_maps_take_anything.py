@@ -21,7 +21,7 @@ from mapping.features.histograms import Box, axis_walls
 from mapping.features.scenes import SCENE_FEATURES, SceneDatabase, scene_vector, sight_of
 from mapping.frames import IDENTITY, Pose2, Pose3
 from mapping.grids.beam_model import beam_table
-from mapping.grids.sonar_model import SonarMemory, SonarRules, cone_of_reading, guard_rows
+from mapping.grids.sonar_model import SonarMemory, SonarRules, cone_of_reading
 from mapping.lines.extract import are_in_order, extract_lines
 from mapping.lines.free_space import FreeSpace
 from mapping.lines.line_map import LineMap
@@ -347,7 +347,7 @@ def test_sonars_say_nothing_or_something_within_reach(
     heard: list[tuple[str | None, float, Pose2]], clear_no_return: bool
 ) -> None:
     rules = SonarRules()
-    memory = SonarMemory(rules)
+    memory = SonarMemory(rules, 0.05)
     for name, range_m, pose in heard:
         if not memory.believe(name, range_m, pose.x_m, pose.y_m):
             continue
@@ -357,6 +357,6 @@ def test_sonars_say_nothing_or_something_within_reach(
         )  # fmt: skip
         if cone is not None:
             memory.remember(name, cone)
-        guards = guard_rows(memory.guards(name), 0.05)
+        guards = memory.guards(name)
         assert guards.shape[1:] == (7,)
         assert np.isfinite(guards).all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import jsonschema
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.scan import Scan
+from service import scene_maker
 from service.map_makers import MapMaker, MapView
 from service.outputs import DocumentOut
 from service.payloads import Encoder
@@ -68,6 +70,26 @@ def test_where_am_i_is_the_bases_pose_by_the_newest_sweep() -> None:
     assert place["yaw_rad"] == pytest.approx(truth.yaw_rad, abs=0.02)
     assert answer == maker.where_am_i({"laser": "front"})
     json.dumps(answer, allow_nan=False)
+
+
+def test_sweeps_of_a_robot_that_stays_are_looked_at_when_somebody_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[int] = []
+
+    def noting(middle: Pose2, scan: Scan, poses: F64) -> Scan:
+        looked.append(scan.stamp_ns)
+        return scan
+
+    monkeypatch.setattr(scene_maker, "_as_seen_from", noting)
+    maker = SceneMaker({"front": MOUNT})
+    scan = scan_at(flat(), PLACES[0])
+    poses = np.tile(row(PLACES[0]), (BEARING.size, 1))
+    for stamp_ns in range(1, 11):
+        maker.take_sweep("front", replace(scan, stamp_ns=stamp_ns), poses)
+    assert looked == [1]
+    answer = maker.where_am_i({})
+    assert looked == [1, 10]
+    assert answer == maker.where_am_i({})
+    assert looked == [1, 10]
 
 
 def test_unknown_is_an_answer_with_its_reason() -> None:
