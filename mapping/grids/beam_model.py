@@ -10,8 +10,8 @@ A beam is a narrow cone. Its end cell is evidence for an obstacle, the way there
   its own line passes, no more.
 - A wedge frees the cells whose centre it contains, a line the cells it passes. A cell counts once per scan, and a
   cell with a hit in it is not cleared by that scan.
-- +inf (nothing seen) is free up to range_max_m, if the device can be trusted to say so (`clear_no_return`). -inf (too
-  close) frees nothing and puts an obstacle at range_min_m, if one is given. NaN proves nothing, and neither does a
+- +inf (nothing seen) is free as far as its neighbours bear it out (`mapping.no_echo`), if the device can be trusted to
+  say so (`clear_no_return`). -inf (too close) frees nothing and puts an obstacle at range_min_m, if one is given. NaN proves nothing, and neither does a
   number below 0 or beyond range_max_m: a real measurement cannot be there.
 """
 
@@ -25,14 +25,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapping.kernels import grids as kernels
 from mapping.kernels import motion
+from mapping.no_echo import MAX_WEDGE_RAD, NEIGHBOUR_FACTOR, reach_without_echo, widest_gap
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-
-NEIGHBOUR_FACTOR: Final = 1.5
-MAX_WEDGE_RAD: Final = 0.2  # farther apart, beams are separate sensors
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +38,15 @@ class BeamTable:
     """Directions of a device's beams by ascending bearing, made once per set of bearings.
 
     bearing_rad: as given.  order: (N,) beam at each place of the table, None if they come in order.
+    turned_rad: (N,) ascending, from the first that was given.  gap_max_rad: neighbours are no farther apart.
     dir_x, dir_y: (N,) unit vectors.  wedge_m: (N,) how far the wedge to the next entry (the last: to the first) may be
     called looked through; 0 if they are not neighbours.
     """
 
     bearing_rad: F64
     order: I64 | None
+    turned_rad: F64
+    gap_max_rad: float
     dir_x: F64
     dir_y: F64
     wedge_m: F64
@@ -66,23 +67,16 @@ def beam_table(bearing_rad: F64, fill_gap_m: float) -> BeamTable:
         turned = turned[order]
     sorted_bearing = bearing if order is None else bearing[order]
     gap = np.append(np.diff(turned), 2.0 * np.pi - turned[-1:] + turned[:1])
+    gap_max = widest_gap(gap[:-1])
     return BeamTable(
         bearing_rad=bearing,
         order=order,
+        turned_rad=turned,
+        gap_max_rad=gap_max,
         dir_x=np.cos(sorted_bearing),
         dir_y=np.sin(sorted_bearing),
-        wedge_m=_wedges(gap, fill_gap_m),
+        wedge_m=np.where(gap <= gap_max, fill_gap_m / np.maximum(gap, 1e-9), 0.0),
     )
-
-
-def _wedges(gap_rad: F64, fill_gap_m: float) -> F64:
-    """How far the wedge after each beam may be filled. gap_rad: (N,) to the next beam, the last to the first."""
-    inner = gap_rad[:-1][gap_rad[:-1] > 0.0]
-    if inner.size == 0:
-        return np.zeros(gap_rad.size)
-    nominal = float(np.median(inner))
-    neighbours = gap_rad <= min(NEIGHBOUR_FACTOR * nominal, MAX_WEDGE_RAD)
-    return np.where(neighbours, fill_gap_m / np.maximum(gap_rad, 1e-9), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +105,11 @@ def beams_of_scan(
     pose = np.asarray(map_from_sensor, dtype=np.float64)
     if pose.shape not in ((n, 3), (3,)):
         raise ValueError(f"poses are (N, 3) with N = {n} beams, or (3,), got {pose.shape}")
+    reach = scan.range_m
+    if clear_no_return:
+        reach = reach_without_echo(scan.bearing_rad, scan.range_m, scan.range_max_m)
     origin, end, free, hit = motion.beam_lines(
-        np.ascontiguousarray(np.broadcast_to(pose, (n, 3))), scan.bearing_rad, scan.range_m, scan.range_min_m,
+        np.ascontiguousarray(np.broadcast_to(pose, (n, 3))), scan.bearing_rad, scan.range_m, reach, scan.range_min_m,
         scan.range_max_m, min(scan.range_max_m, use_max_m), clear_no_return,
     )  # fmt: skip
     return Beams(origin_m=origin, end_m=end, free=free, hit=hit)
@@ -171,7 +168,7 @@ def _sorted_fan(beams: Beams, origin_m: F64, spread_m: float, fill_gap_m: float)
 
 
 def _wedges_between(gap_rad: F64, adjacent: Bools, fill_gap_m: float) -> F64:
-    """As _wedges, where beams are neighbours only if they also were measured one after the other."""
+    """As in a BeamTable, where beams are neighbours only if they also were measured one after the other."""
     between = gap_rad[adjacent]
     if between.size == 0:
         return np.zeros(gap_rad.size)

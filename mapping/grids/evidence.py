@@ -85,7 +85,7 @@ class _Work:
         self.saved(1 << 14)
 
     def beams(self, n: int) -> None:
-        self.free_len, self.hit_len, self.ray_x, self.ray_y = np.zeros((4, n))
+        self.free_len, self.hit_len, self.ray_x, self.ray_y, self.silent_m = np.zeros((5, n))
         self.from_x, self.from_y, self.to_x, self.to_y = np.zeros((4, n))
         self.todo_row, self.todo_col = np.zeros((2, n), dtype=np.int64)
 
@@ -205,9 +205,9 @@ class EvidenceGrid:
             return
         w, pool = self._beam_work(ranges.size), self._pool
         while not kernels.insert_scan(
-            ox, oy, math.cos(map_from_sensor.yaw_rad), math.sin(map_from_sensor.yaw_rad), ranges,
-            1.0 / self.resolution_m, float(range_min_m), float(range_max_m), self._use_max_m, bool(clear_no_return),
-            table.dir_x, table.dir_y, wedge, w.free_len, w.hit_len, w.ray_x, w.ray_y, w.from_x, w.from_y, w.to_x,
+            ox, oy, math.cos(map_from_sensor.yaw_rad), math.sin(map_from_sensor.yaw_rad), table.turned_rad,
+            table.gap_max_rad, ranges, 1.0 / self.resolution_m, float(range_min_m), float(range_max_m), self._use_max_m, bool(clear_no_return),
+            w.silent_m, table.dir_x, table.dir_y, wedge, w.free_len, w.hit_len, w.ray_x, w.ray_y, w.from_x, w.from_y, w.to_x,
             w.to_y, w.cross_row, w.cross_col, w.sorted_col, w.rows, w.todo_row, w.todo_col, w.saved_at,
             w.saved_value, w.saved_kind, w.needed, window,
             pool.tile_row0, pool.tile_col0, pool.cells, pool.index, pool.tile_at, pool.free_slots, pool.flags,

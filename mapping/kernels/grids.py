@@ -26,6 +26,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from mapping.kernels.no_echo import reach_without_echo
+
 TILE_BITS = 7
 TILE = 1 << TILE_BITS
 TILE_MASK = TILE - 1
@@ -374,17 +376,19 @@ def insert_fan(
 
 @njit(cache=True, nogil=True)
 def beam_lengths(
-    range_m: Any, per_m: float, range_min_m: float, range_max_m: float, use_max_m: float, clear_no_return: bool,
-    free_len: Any, hit_len: Any,
+    bearing: Any, gap_max: float, range_m: Any, per_m: float, range_min_m: float, range_max_m: float, use_max_m: float,
+    clear_no_return: bool, silent_m: Any, free_len: Any, hit_len: Any,
 ) -> bool:  # fmt: skip
     """What each beam proves, in cells: free up to free_len, an obstacle at hit_len; negative: nothing.
 
-    +inf is free up to range_max_m if clear_no_return. -inf frees nothing and is an obstacle at range_min_m if that is
+    +inf is free as far as mapping.no_echo has it if clear_no_return; silent_m: (N,) room for that. -inf frees nothing and is an obstacle at range_min_m if that is
     positive. NaN, negative numbers and numbers beyond range_max_m prove nothing. use_max_m cuts everything short.
     Returns whether any beam proves anything.
     """
     reach = min(range_max_m, use_max_m)
     some = False
+    if clear_no_return:
+        reach_without_echo(bearing, range_m, range_max_m, gap_max, silent_m)
     for i in range(range_m.size):
         r = range_m[i]
         free, hit = -1.0, -1.0
@@ -393,8 +397,8 @@ def beam_lengths(
             if r <= reach:
                 hit = r * per_m
         elif r == np.inf:
-            if clear_no_return:
-                free = reach * per_m
+            if clear_no_return and silent_m[i] > 0.0:
+                free = min(silent_m[i], use_max_m) * per_m
         elif r == -np.inf and range_min_m > 0.0:
             hit = range_min_m * per_m
         free_len[i] = free
@@ -405,9 +409,9 @@ def beam_lengths(
 
 @njit(cache=True, nogil=True)
 def insert_scan(
-    ox: float, oy: float, cos_yaw: float, sin_yaw: float, range_m: Any, per_m: float, range_min_m: float,
-    range_max_m: float, use_max_m: float, clear_no_return: bool, dir_x: Any, dir_y: Any, wedge: Any, free_len: Any,
-    hit_len: Any, ray_x: Any, ray_y: Any, from_x: Any, from_y: Any, to_x: Any, to_y: Any,
+    ox: float, oy: float, cos_yaw: float, sin_yaw: float, bearing: Any, gap_max: float, range_m: Any, per_m: float,
+    range_min_m: float, range_max_m: float, use_max_m: float, clear_no_return: bool, silent_m: Any, dir_x: Any, dir_y: Any, wedge: Any,
+    free_len: Any, hit_len: Any, ray_x: Any, ray_y: Any, from_x: Any, from_y: Any, to_x: Any, to_y: Any,
     cross_row: Any, cross_col: Any, sorted_col: Any, row_start: Any,
     todo_row: Any, todo_col: Any, saved_at: Any, saved_value: Any, saved_kind: Any, needed: Any,
     window: Any, tile_row0: int, tile_col0: int, cells: Any, index: Any, tile_at: Any, free_slots: Any, flags: Any,
@@ -415,7 +419,8 @@ def insert_scan(
 ) -> bool:  # fmt: skip
     """beam_lengths, then insert_fan."""
     if not beam_lengths(
-        range_m, per_m, range_min_m, range_max_m, use_max_m, clear_no_return, free_len, hit_len
+        bearing, gap_max, range_m, per_m, range_min_m, range_max_m, use_max_m, clear_no_return, silent_m, free_len,
+        hit_len,
     ):  # fmt: skip
         return True
     return bool(

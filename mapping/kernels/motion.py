@@ -209,11 +209,12 @@ def rolled_covariance(
 
 @njit(cache=True)
 def beam_lines(
-    pose: Any, bearing: Any, distance: Any, range_min: float, range_max: float, reach: float, clear_no_return: bool
-) -> tuple[Any, Any, Any, Any]:
+    pose: Any, bearing: Any, distance: Any, silent: Any, range_min: float, range_max: float, reach: float,
+    clear_no_return: bool,
+) -> tuple[Any, Any, Any, Any]:  # fmt: skip
     """Beams from a pose each (N, 3): where they start and end (N, 2), whether they prove free space, and an obstacle.
 
-    reach: of a beam that saw nothing, and beyond which one is cut.  A beam that proves nothing ends at NaN.
+    silent: (N,) how far a beam that saw nothing is free.  reach: beyond it a beam is cut.  A beam that proves nothing ends at NaN.
     """
     count = len(bearing)
     origin, end = np.empty((count, 2)), np.empty((count, 2))
@@ -226,8 +227,8 @@ def beam_lines(
         if 0.0 <= r <= range_max:
             length = min(r, reach)
             free[k], hit[k] = placed, placed and r <= reach
-        elif r == math.inf and clear_no_return:
-            length = reach
+        elif r == math.inf and clear_no_return and silent[k] > 0.0:
+            length = min(silent[k], reach)
             free[k] = placed
         elif r == -math.inf and range_min > 0.0:
             length = range_min

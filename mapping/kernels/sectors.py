@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from mapping.kernels.no_echo import reach_without_echo
+
 TWO_PI = 2.0 * math.pi
 CELL_SLACK_M = 1e-9
 EDGE_RAD = 1e-9  # bearings closer to an edge than this lie on it
@@ -189,7 +191,7 @@ def thin_sectors(
     """Thin sectors of beams: lo, hi, length (M,) of those with a length, lo, hi (K,) of all valid ones.
 
     bearing: (N,) ascending within one turn.  Neighbours no farther apart than gap_max meet half-way, others leave half
-    a spacing.  length: range_max for a beam that saw nothing; none where nothing is proved free.
+    a spacing.  length: as in mapping.no_echo for a beam that saw nothing; none where nothing is proved free.
     """
     count = len(bearing)
     lo, hi = np.empty(count), np.empty(count)
@@ -198,13 +200,16 @@ def thin_sectors(
         reach = 0.5 * gap if gap <= gap_max else 0.5 * spacing
         hi[k] = bearing[k] + reach
         lo[k + 1 if k + 1 < count else 0] = bearing[k + 1 if k + 1 < count else 0] - reach
+    silent = np.empty(count)
+    if range_max < math.inf:
+        reach_without_echo(bearing, distance, range_max, gap_max, silent)
     seen_lo, seen_hi, length = np.empty(count), np.empty(count), np.empty(count)
     looked_lo, looked_hi = np.empty(count), np.empty(count)
     sees = looks = 0
     for k in range(count):
         r = distance[k]
         if r == math.inf:
-            r = range_max if range_max < math.inf else 0.0
+            r = silent[k] if range_max < math.inf else 0.0
         elif r > 0.0:
             r = r if r <= range_max else 0.0
         elif r == 0.0 or r == -math.inf:  # too close

@@ -13,6 +13,7 @@ from shapely import LineString, MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from mapping.frames import Pose2
+from mapping.no_echo import reach_without_echo
 
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -30,7 +31,7 @@ def visibility_polygon(
 
     bearing_rad, range_m: (N,), rising or falling by at most a full turn. Between two neighbouring beams lies free
     space up to the chord of their ends if these are closer than gap_m or 6 beam widths, else up to the shorter of the
-    two. +inf is free up to range_max_m if the device can be trusted to say "nothing seen" (clear_no_return); NaN, -inf
+    two. +inf is free as in mapping.no_echo if the device can be trusted to say "nothing seen" (clear_no_return); NaN, -inf
     and numbers outside (0, range_max_m] prove nothing, and neither does a single beam, which has no width.
     Returns a MultiPolygon, empty if nothing is free. Raises ValueError for other shapes and bearings that go astray.
     """
@@ -158,7 +159,8 @@ def _beams(
     if np.any(step <= 0.0) or float(np.sum(step)) >= 2.0 * math.pi + 1e-9:
         raise ValueError("bearing_rad must rise or fall throughout, by no more than a full turn")
     hit = (ranges > 0.0) & (ranges <= range_max_m)
-    reach = np.where(hit, ranges, np.where((ranges == np.inf) & clear_no_return, range_max_m, 0.0))
+    silent = reach_without_echo(bearing, ranges, range_max_m)
+    reach = np.where(hit, ranges, np.where((ranges == np.inf) & clear_no_return, silent, 0.0))
     return bearing, reach, hit
 
 

@@ -14,6 +14,7 @@ from mapping.frames import Pose2
 from mapping.grids.beam_model import beams_of_scan
 from mapping.grids.occupancy import CellRules, OccupancyGrid
 from mapping.grids.tiles import Window
+from mapping.no_echo import reach_without_echo
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -101,10 +102,11 @@ def as_set(mask: NDArray[np.bool_], window: Window) -> Cells:
 # ------------------------------------------------------------------------------------------ the slow literal reference
 
 
-def free_length(r: float, clear_no_return: bool) -> float:
-    if r == math.inf:
-        return RANGE_MAX_M if clear_no_return else -1.0
-    return r if 0.0 <= r <= RANGE_MAX_M else -1.0
+def free_lengths(place: F64, range_m: F64, clear_no_return: bool) -> list[float]:
+    """Of beams by ascending bearing; how far silence goes has tests of its own (test_no_echo)."""
+    silent = reach_without_echo(place, range_m, RANGE_MAX_M)
+    silent = np.where(np.isposinf(range_m) & clear_no_return & (silent > 0.0), silent, -1.0)
+    return [float(r) if 0.0 <= r <= RANGE_MAX_M else float(s) for r, s in zip(range_m, silent)]
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,7 @@ def expected(sweep: Sweep, *, fill: str, clear_no_return: bool) -> Expected:
     gaps = [place[order[k + 1]] - place[order[k]] for k in range(n - 1)] + [2 * math.pi - place[order[-1]]]
     positive = [g for g in gaps[:-1] if g > 0.0]
     nominal = float(np.median(positive)) if positive else 0.0
-    free = [free_length(float(sweep.range_m[i]), clear_no_return) for i in order]
+    free = free_lengths(place[order], sweep.range_m[order], clear_no_return)
     wedge = [0.0] * n
     for k in range(n):
         if fill == "wedges" and nominal > 0.0 and gaps[k] <= min(1.5 * nominal, 0.2):
@@ -240,11 +242,11 @@ def test_no_cell_is_freed_beyond_what_the_beams_beside_it_saw(sweep: Sweep) -> N
     """Independent of how cells are filled: a freed cell has a beam near enough in bearing that looked as far."""
     window = around(sweep)
     _, misses = counts(grid_of(sweep), window)
-    free = [free_length(float(r), True) for r in sweep.range_m]
-    known = np.array([length >= 0.0 for length in free])
+    free = np.where(np.isposinf(sweep.range_m), RANGE_MAX_M, sweep.range_m)
+    known = (free >= 0.0) & (free <= RANGE_MAX_M)
     assert bool(misses.any()) <= bool(known.any())
     angle = sweep.bearing_rad[known] + sweep.pose.yaw_rad
-    length = np.array(free)[known]
+    length = free[known]
     for row, col in np.argwhere(misses > 0):
         x = (col + window.col0 + 0.5) * D - sweep.pose.x_m
         y = (row + window.row0 + 0.5) * D - sweep.pose.y_m
