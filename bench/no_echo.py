@@ -1,6 +1,6 @@
 """What beams without echo free: in made worlds with things that give no echo at all, and where silence is true.
 
-    python bench/no_echo.py [--json FILE]
+    python bench/no_echo.py [--only WORDS] [--json FILE]
 
 Three lasers drive through each world, turning round at both ends of the way. Their sweeps are put into three grids:
 silence believed up to the laser's reach, as mapping.no_echo bounds it, and not at all. Told are square metres that are
@@ -11,6 +11,7 @@ it, behind walls); and how much of what silence truly frees within 20 m of the w
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import sys
@@ -52,7 +53,8 @@ class Kind:
     @property
     def bearing_rad(self) -> F64:
         half = 0.5 * self.view_deg
-        return np.radians(np.arange(-half, half - 1e-9 if self.view_deg >= 360.0 else half + 1e-9, self.step_deg))
+        end = half - 1e-9 if self.view_deg >= 360.0 else half + 1e-9
+        return np.asarray(np.radians(np.arange(-half, end, self.step_deg)))
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,8 @@ def scenes() -> dict[str, Scene]:
         "black cabinet in an office corridor": with_black(
             (room(-10.0, -1.0, 10.0, 1.0), room(-10.0, 1.1, 10.0, 7.0)), ((-8.0, 0.0), (6.0, 0.0)),
             (0.0, 0.55, 0.9, 0.95),
-        ),  # fmt: skip
-    }
+        ),
+    }  # fmt: skip
     jambs = (Wall(points=((0.0, 0.5), (0.0, 4.0))), Wall(points=((0.0, -4.0), (0.0, -0.5))))
     found["door into a hall without echo"] = with_black(
         (*jambs, Wall(points=((0.0, 4.0), (-6.0, 4.0), (-6.0, -4.0), (0.0, -4.0)))), ((-5.0, 0.0), (8.0, 0.0))
@@ -126,7 +128,7 @@ def scenes() -> dict[str, Scene]:
 def poses_on(way: tuple[tuple[float, float], ...]) -> list[Pose2]:
     """Every 0.2 m, and a turn on the spot at both ends."""
     poses: list[Pose2] = []
-    for (x0, y0), (x1, y1) in zip(way, way[1:]):
+    for (x0, y0), (x1, y1) in itertools.pairwise(way):
         length, yaw = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
         for s in np.arange(0.0, length, 0.2):
             poses.append(Pose2(x0 + s / length * (x1 - x0), y0 + s / length * (y1 - y0), yaw))
@@ -179,7 +181,7 @@ def drive(scene: Scene, laser: Kind) -> dict[str, OccupancyGrid]:
 
 
 def figures(scene: Scene, laser: Kind) -> dict[str, float]:
-    """Square metres: by rule, free inside what is black, free elsewhere where nobody can get, truly free near the way."""
+    """Square metres by rule: free inside what is black, free elsewhere where nobody can get, truly free by the way."""
     grids = drive(scene, laser)
     patches = {name: grid.patch() for name, grid in grids.items()}
     row0, col0 = (min(getattr(p, at) for p in patches.values()) for at in ("row0", "col0"))
@@ -234,11 +236,14 @@ def surfaces(world: World) -> list[F64]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--only", default="")
+    parser.add_argument("--only", default="", help="worlds whose name holds this")
     args = parser.parse_args()
     worlds.BLACK_REACH_M = 0.0  # no echo from any distance
     told = {}
-    print("square metres; in black / behind walls and black things / truly free near the way, of it by silence")
+    print(
+        "square metres called free: in black / behind it and behind walls / truly free near the way, of it by silence"
+    )
+    print("silence believed up to the reach | bounded by echoes beside it | not believed")
     for laser_name, laser in LASERS.items():
         print(f"\n{laser_name}")
         for name, scene in scenes().items():
@@ -246,7 +251,8 @@ def main() -> None:
                 continue
             told[f"{laser_name}: {name}"] = f = figures(scene, laser)
             cells = " | ".join(
-                f"{f[f'{k}: in black']:5.2f} / {f[f'{k}: behind']:7.1f} / {f[f'{k}: all']:7.1f} {f[f'{k}: by silence']:7.1f}"
+                f"{f[f'{k}: in black']:5.2f} / {f[f'{k}: behind']:7.1f} / {f[f'{k}: all']:7.1f}, "
+                f"{f[f'{k}: by silence']:6.1f}"
                 for k in RULES
             )
             print(f"{name:40s} {cells}", flush=True)

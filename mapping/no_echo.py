@@ -28,8 +28,6 @@ F64 = NDArray[np.float64]
 
 WIDE_M: Final = kernels.WIDE_M
 OPEN_M: Final = kernels.OPEN_M
-NEIGHBOUR_FACTOR: Final = 1.5  # neighbours are no farther apart than this many times the usual spacing
-MAX_WEDGE_RAD: Final = 0.2  # farther apart, beams are separate sensors
 
 
 def reach_without_echo(bearing_rad: F64, range_m: F64, range_max_m: float) -> F64:
@@ -44,11 +42,5 @@ def reach_without_echo(bearing_rad: F64, range_m: F64, range_max_m: float) -> F6
         return range_m
     reach = np.array(range_m, dtype=np.float64)
     bearing, ranges = (np.ascontiguousarray(each, dtype=np.float64) for each in (bearing_rad, range_m))
-    kernels.reach_without_echo(bearing, ranges, float(range_max_m), widest_gap(np.abs(np.diff(bearing))), reach)
+    kernels.reach_without_echo(bearing, ranges, float(range_max_m), kernels.widest_gap(bearing), reach)
     return reach
-
-
-def widest_gap(step_rad: F64) -> float:
-    """How far apart two beams may be and still be neighbours. step_rad: (N,) between all that follow each other."""
-    steps = step_rad[step_rad > 0.0]
-    return min(NEIGHBOUR_FACTOR * float(np.median(steps)), MAX_WEDGE_RAD) if steps.size else 0.0

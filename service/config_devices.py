@@ -175,12 +175,12 @@ _PORT = (
     "device's serial number (serial:H0614967, the same as serial = ...)."
 )
 _NOTHING_SEEN = (
-    "What it means when the laser says that it saw nothing. clear: free up to the farthest echo; unknown: nothing, as "
-    "where there is glass, which the beam passes."
+    "What it means when the laser says that it saw nothing. clear: free up to the line between the echoes beside it "
+    "(docs/algorithms/grids.md); unknown: nothing, as where things stand that give no echo."
 )
 _NO_ECHO = (
-    "What a distance of 0 means. unknown: too far, or too near, too dark, glass; clear: nothing up to the farthest "
-    "echo, which frees space and is right only where none of these is around."
+    "What a distance of 0 means. unknown: too far, or too near, too dark, glass; clear: nothing up to the line between "
+    "the echoes beside it, which frees space and is right only where none of these is around."
 )
 
 

@@ -4,7 +4,7 @@
     [[walls]]                        # a run of wall, drawn by its middle line; both faces are seen
     points = [[0, 0], [4, 0], [4, 3]]
     thickness_m = 0.10               # 0: a single face
-    material = "wall"                # wall | glass | black | soft
+    material = "wall"                # wall | glass | black | soft: below
     bottom_m = 0.0
     top_m = 2.5                      # a sensor at another height does not see it
     [[doors]]                        # a leaf on its hinge, swung open from closed_deg by open_deg
@@ -35,6 +35,9 @@
     points = [[0.8, 4.1], [7.5, 4.1]]  # corners are rounded; sharp ones are turned on the spot
     closed = true                    # go round again and again
     speed_m_s = 1.0
+
+Glass answers light only within 5 degrees of head on, black only up to 6 m, at a slant sooner, and says nothing beyond;
+both answer sound. Soft things answer light, not sound.
 
 Faults are reported as WorldError with the file, the table and the key.
 """

@@ -10,22 +10,21 @@ A beam is a narrow cone. Its end cell is evidence for an obstacle, the way there
   its own line passes, no more.
 - A wedge frees the cells whose centre it contains, a line the cells it passes. A cell counts once per scan, and a
   cell with a hit in it is not cleared by that scan.
-- +inf (nothing seen) is free as far as its neighbours bear it out (`mapping.no_echo`), if the device can be trusted to
-  say so (`clear_no_return`). -inf (too close) frees nothing and puts an obstacle at range_min_m, if one is given. NaN proves nothing, and neither does a
-  number below 0 or beyond range_max_m: a real measurement cannot be there.
+- +inf (nothing seen) is free as far as the echoes beside it bear it out (`mapping.no_echo`), if the device can be
+  trusted to say so (`clear_no_return`). -inf (too close) frees nothing and puts an obstacle at range_min_m, if one is
+  given. NaN proves nothing, and neither does a number below 0 or beyond range_max_m: no measurement can be there.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.kernels import grids as kernels
 from mapping.kernels import motion
-from mapping.no_echo import MAX_WEDGE_RAD, NEIGHBOUR_FACTOR, reach_without_echo, widest_gap
+from mapping.kernels.no_echo import MAX_WEDGE_RAD, NEIGHBOUR_FACTOR
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -67,7 +66,7 @@ def beam_table(bearing_rad: F64, fill_gap_m: float) -> BeamTable:
         turned = turned[order]
     sorted_bearing = bearing if order is None else bearing[order]
     gap = np.append(np.diff(turned), 2.0 * np.pi - turned[-1:] + turned[:1])
-    gap_max = widest_gap(gap[:-1])
+    gap_max = _widest(gap[:-1][gap[:-1] > 0.0])
     return BeamTable(
         bearing_rad=bearing,
         order=order,
@@ -77,6 +76,11 @@ def beam_table(bearing_rad: F64, fill_gap_m: float) -> BeamTable:
         dir_y=np.sin(sorted_bearing),
         wedge_m=np.where(gap <= gap_max, fill_gap_m / np.maximum(gap, 1e-9), 0.0),
     )
+
+
+def _widest(step_rad: F64) -> float:
+    """How far apart two beams may be and still be neighbours."""
+    return min(NEIGHBOUR_FACTOR * float(np.median(step_rad)), MAX_WEDGE_RAD) if step_rad.size else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +109,8 @@ def beams_of_scan(
     pose = np.asarray(map_from_sensor, dtype=np.float64)
     if pose.shape not in ((n, 3), (3,)):
         raise ValueError(f"poses are (N, 3) with N = {n} beams, or (3,), got {pose.shape}")
-    reach = scan.range_m
-    if clear_no_return:
-        reach = reach_without_echo(scan.bearing_rad, scan.range_m, scan.range_max_m)
     origin, end, free, hit = motion.beam_lines(
-        np.ascontiguousarray(np.broadcast_to(pose, (n, 3))), scan.bearing_rad, scan.range_m, reach, scan.range_min_m,
+        np.ascontiguousarray(np.broadcast_to(pose, (n, 3))), scan.bearing_rad, scan.range_m, scan.range_min_m,
         scan.range_max_m, min(scan.range_max_m, use_max_m), clear_no_return,
     )  # fmt: skip
     return Beams(origin_m=origin, end_m=end, free=free, hit=hit)

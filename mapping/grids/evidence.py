@@ -206,10 +206,10 @@ class EvidenceGrid:
         w, pool = self._beam_work(ranges.size), self._pool
         while not kernels.insert_scan(
             ox, oy, math.cos(map_from_sensor.yaw_rad), math.sin(map_from_sensor.yaw_rad), table.turned_rad,
-            table.gap_max_rad, ranges, 1.0 / self.resolution_m, float(range_min_m), float(range_max_m), self._use_max_m, bool(clear_no_return),
-            w.silent_m, table.dir_x, table.dir_y, wedge, w.free_len, w.hit_len, w.ray_x, w.ray_y, w.from_x, w.from_y, w.to_x,
-            w.to_y, w.cross_row, w.cross_col, w.sorted_col, w.rows, w.todo_row, w.todo_col, w.saved_at,
-            w.saved_value, w.saved_kind, w.needed, window,
+            table.gap_max_rad, ranges, 1.0 / self.resolution_m, float(range_min_m), float(range_max_m),
+            self._use_max_m, bool(clear_no_return), w.silent_m, table.dir_x, table.dir_y, wedge, w.free_len, w.hit_len,
+            w.ray_x, w.ray_y, w.from_x, w.from_y, w.to_x, w.to_y, w.cross_row, w.cross_col, w.sorted_col, w.rows,
+            w.todo_row, w.todo_col, w.saved_at, w.saved_value, w.saved_kind, w.needed, window,
             pool.tile_row0, pool.tile_col0, pool.cells, pool.index, pool.tile_at, pool.free_slots, pool.flags,
             pool.state, self._model_number, self._rule,
         ):  # fmt: skip

@@ -381,9 +381,9 @@ def beam_lengths(
 ) -> bool:  # fmt: skip
     """What each beam proves, in cells: free up to free_len, an obstacle at hit_len; negative: nothing.
 
-    +inf is free as far as mapping.no_echo has it if clear_no_return; silent_m: (N,) room for that. -inf frees nothing and is an obstacle at range_min_m if that is
-    positive. NaN, negative numbers and numbers beyond range_max_m prove nothing. use_max_m cuts everything short.
-    Returns whether any beam proves anything.
+    +inf is free as far as mapping.no_echo has it if clear_no_return; silent_m: (N,) room for that. -inf frees nothing
+    and is an obstacle at range_min_m if that is positive. NaN, negative numbers and numbers beyond range_max_m prove
+    nothing. use_max_m cuts everything short. Returns whether any beam proves anything.
     """
     reach = min(range_max_m, use_max_m)
     some = False
@@ -410,8 +410,9 @@ def beam_lengths(
 @njit(cache=True, nogil=True)
 def insert_scan(
     ox: float, oy: float, cos_yaw: float, sin_yaw: float, bearing: Any, gap_max: float, range_m: Any, per_m: float,
-    range_min_m: float, range_max_m: float, use_max_m: float, clear_no_return: bool, silent_m: Any, dir_x: Any, dir_y: Any, wedge: Any,
-    free_len: Any, hit_len: Any, ray_x: Any, ray_y: Any, from_x: Any, from_y: Any, to_x: Any, to_y: Any,
+    range_min_m: float, range_max_m: float, use_max_m: float, clear_no_return: bool, silent_m: Any,
+    dir_x: Any, dir_y: Any, wedge: Any, free_len: Any,
+    hit_len: Any, ray_x: Any, ray_y: Any, from_x: Any, from_y: Any, to_x: Any, to_y: Any,
     cross_row: Any, cross_col: Any, sorted_col: Any, row_start: Any,
     todo_row: Any, todo_col: Any, saved_at: Any, saved_value: Any, saved_kind: Any, needed: Any,
     window: Any, tile_row0: int, tile_col0: int, cells: Any, index: Any, tile_at: Any, free_slots: Any, flags: Any,

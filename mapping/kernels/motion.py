@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from mapping.kernels.no_echo import reach_without_echo, widest_gap
+
 TWO_PI = 2.0 * math.pi
 SMALL_RAD = 1e-6
 
@@ -209,16 +211,19 @@ def rolled_covariance(
 
 @njit(cache=True)
 def beam_lines(
-    pose: Any, bearing: Any, distance: Any, silent: Any, range_min: float, range_max: float, reach: float,
-    clear_no_return: bool,
-) -> tuple[Any, Any, Any, Any]:  # fmt: skip
+    pose: Any, bearing: Any, distance: Any, range_min: float, range_max: float, reach: float, clear_no_return: bool
+) -> tuple[Any, Any, Any, Any]:
     """Beams from a pose each (N, 3): where they start and end (N, 2), whether they prove free space, and an obstacle.
 
-    silent: (N,) how far a beam that saw nothing is free.  reach: beyond it a beam is cut.  A beam that proves nothing ends at NaN.
+    The beams are in order of bearing.  reach: beyond it a beam is cut; how far one is free that saw nothing:
+    mapping.no_echo.  A beam that proves nothing ends at NaN.
     """
     count = len(bearing)
     origin, end = np.empty((count, 2)), np.empty((count, 2))
     free, hit = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+    silent = np.empty(count)
+    if clear_no_return:
+        reach_without_echo(bearing, distance, range_max, widest_gap(bearing), silent)
     for k in range(count):
         x, y, yaw, r = pose[k, 0], pose[k, 1], pose[k, 2], distance[k]
         origin[k, 0], origin[k, 1] = x, y

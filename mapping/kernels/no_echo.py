@@ -8,11 +8,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 from numba import njit
 
 TWO_PI = 2.0 * math.pi
 WIDE_RAD, WIDE_M = TWO_PI / 3.0, 2.0  # so much silence in a row is believed so far, whatever is beside it
 OPEN_RAD, OPEN_M = math.pi - 1e-6, 10.0
+NEIGHBOUR_FACTOR = 1.5  # neighbours are no farther apart than this many times the usual spacing
+MAX_WEDGE_RAD = 0.2  # farther apart, beams are separate sensors
+SAMPLES = 31
 
 
 @njit(cache=True)
@@ -21,6 +25,24 @@ def turn_to(bearing: Any, k: int) -> float:
     if k > 0:
         return float(abs(bearing[k] - bearing[k - 1]))
     return float(abs(TWO_PI - abs(bearing[len(bearing) - 1] - bearing[0])))
+
+
+@njit(cache=True)
+def widest_gap(bearing: Any) -> float:
+    """How far apart two beams (N,) in order may be and still be neighbours, by the middle one of some of the steps."""
+    steps = len(bearing) - 1
+    if steps < 1:
+        return 0.0
+    taken = np.empty(min(SAMPLES, steps))
+    for i in range(len(taken)):
+        k = (2 * i + 1) * steps // (2 * len(taken)) + 1
+        turn = abs(bearing[k] - bearing[k - 1])
+        j = i
+        while j > 0 and taken[j - 1] > turn:
+            taken[j] = taken[j - 1]
+            j -= 1
+        taken[j] = turn
+    return float(min(NEIGHBOUR_FACTOR * taken[len(taken) // 2], MAX_WEDGE_RAD))
 
 
 @njit(cache=True)

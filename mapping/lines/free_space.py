@@ -31,8 +31,8 @@ def visibility_polygon(
 
     bearing_rad, range_m: (N,), rising or falling by at most a full turn. Between two neighbouring beams lies free
     space up to the chord of their ends if these are closer than gap_m or 6 beam widths, else up to the shorter of the
-    two. +inf is free as in mapping.no_echo if the device can be trusted to say "nothing seen" (clear_no_return); NaN, -inf
-    and numbers outside (0, range_max_m] prove nothing, and neither does a single beam, which has no width.
+    two. +inf is free as mapping.no_echo has it if the device can be trusted to say "nothing seen" (clear_no_return);
+    NaN, -inf and numbers outside (0, range_max_m] prove nothing, and neither does a single beam, which has no width.
     Returns a MultiPolygon, empty if nothing is free. Raises ValueError for other shapes and bearings that go astray.
     """
     bearing, reach, _ = _beams(bearing_rad, range_m, range_max_m, clear_no_return)
