@@ -110,8 +110,8 @@ def beams_of_scan(
     if pose.shape not in ((n, 3), (3,)):
         raise ValueError(f"poses are (N, 3) with N = {n} beams, or (3,), got {pose.shape}")
     origin, end, free, hit = motion.beam_lines(
-        np.ascontiguousarray(np.broadcast_to(pose, (n, 3))), scan.bearing_rad, scan.range_m, scan.range_min_m,
-        scan.range_max_m, min(scan.range_max_m, use_max_m), clear_no_return,
+        np.ascontiguousarray(np.broadcast_to(pose, (n, 3))), scan.bearing_rad, scan.range_m,
+        float(scan.range_min_m), float(scan.range_max_m), float(min(scan.range_max_m, use_max_m)), clear_no_return,
     )  # fmt: skip
     return Beams(origin_m=origin, end_m=end, free=free, hit=hit)
 

@@ -61,10 +61,11 @@ def test_what_is_no_measurement_frees_nothing(nothing: float) -> None:
 
 
 def test_no_return_frees_up_to_the_range_if_the_device_can_be_trusted() -> None:
-    grid = OccupancyGrid()
-    look(grid, ranges(np.inf), clear_no_return=False)
+    grid, bearing = OccupancyGrid(), np.radians(np.arange(-95.0, 95.1, 0.5))  # half a turn of silence is believed
+    nothing = np.full(bearing.size, np.inf)
+    grid.insert_scan(HERE, bearing, nothing, range_max_m=5.0, clear_no_return=False)
     assert grid.patch().cells.size == 0
-    look(grid, ranges(np.inf))
+    grid.insert_scan(HERE, bearing, nothing, range_max_m=5.0)
     assert state(grid, 4.9) == FREE
     assert state(grid, 5.06) == UNKNOWN
     assert np.all(grid.patch().cells <= 0)

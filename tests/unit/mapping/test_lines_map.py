@@ -216,13 +216,13 @@ def test_free_space_never_holds_what_no_beam_passed() -> None:
 
 
 def test_nothing_seen_is_free_only_if_the_device_says_so() -> None:
-    bearing, nothing = np.radians(np.arange(-10.0, 11.0)), np.full(21, np.inf)
+    bearing, nothing = np.radians(np.arange(-95.0, 96.0)), np.full(191, np.inf)
     assert visibility_polygon(bearing, nothing, range_max_m=4.0).area == pytest.approx(
-        0.5 * 16.0 * 20 * math.pi / 180, rel=0.001
+        0.5 * 16.0 * 190 * math.pi / 180, rel=0.001
     )
     assert visibility_polygon(bearing, nothing, range_max_m=4.0, clear_no_return=False).is_empty
     for value in (np.nan, -np.inf, 0.0, -1.0, 4.1):
-        assert visibility_polygon(bearing, np.full(21, value), range_max_m=4.0).is_empty
+        assert visibility_polygon(bearing, np.full(191, value), range_max_m=4.0).is_empty
 
 
 def test_falling_bearings_and_a_turned_seam_see_the_same() -> None:

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.frames import IDENTITY, Pose2
+from mapping.no_echo import OPEN_M
 from mapping.sectors.polar import PolarSectors, sector_edges
 from mapping.sectors.snapshot import PolarSnapshot, SectorState
 
@@ -89,12 +90,12 @@ def test_nothing_said_is_unknown() -> None:
     assert len(snapshot.state) == 48
 
 
-def test_no_return_everywhere_is_free_to_the_range() -> None:
+def test_no_return_everywhere_is_free_as_far_as_silence_is_believed() -> None:
     sectors = laser_map()
     sweep(sectors, nothing_seen())
     snapshot = sectors.snapshot(7)
     assert (snapshot.state == FREE).all()
-    assert (snapshot.distance_m == 30.0).all()
+    assert (snapshot.distance_m == OPEN_M).all()
     assert np.isnan(snapshot.bearing_rad).all()
     assert (snapshot.age_ns == 7).all()
     assert (snapshot.source == 0).all()
@@ -118,13 +119,13 @@ def test_a_wall_is_the_nearest_obstacle_of_every_sector() -> None:
 def test_the_sector_beside_a_beam_that_ends_on_its_edge_is_free_only_so_far() -> None:
     sectors = laser_map()
     ranges = nothing_seen()
-    ranges[np.argmin(np.abs(BEARING - math.radians(10.0)))] = 2.0
+    ranges[np.argmin(np.abs(BEARING - math.radians(60.0)))] = 2.0
     sweep(sectors, ranges)
     snapshot = sectors.snapshot(0)
-    assert snapshot.state[at(snapshot, 12.0)] == OBSTACLE
-    assert snapshot.state[at(snapshot, 8.0)] == FREE
-    assert snapshot.distance_m[at(snapshot, 8.0)] == 2.0
-    assert snapshot.distance_m[at(snapshot, 3.0)] == 30.0
+    assert snapshot.state[at(snapshot, 62.0)] == OBSTACLE
+    assert snapshot.state[at(snapshot, 58.0)] == FREE
+    assert snapshot.distance_m[at(snapshot, 58.0)] == 2.0
+    assert snapshot.distance_m[at(snapshot, 53.0)] == OPEN_M
 
 
 @pytest.mark.parametrize("bad", [math.nan, -1.0])
@@ -210,9 +211,9 @@ def test_a_laser_at_the_front_frees_what_lies_outside_the_body() -> None:
     snapshot = sectors.snapshot(0)
     ahead = [at(snapshot, d) for d in (-40.0, 0.1, 40.0, 80.0)]
     assert (snapshot.state[ahead] == FREE).all()
-    # 30 m from the laser, 0.3 m in front: from the kinematic centre ahead is a little more, behind less
-    assert snapshot.distance_m[at(snapshot, 0.1)] == pytest.approx(30.3, abs=0.01)
-    assert 29.7 < snapshot.distance_m[at(snapshot, 80.0)] < 30.2
+    # so far from the laser, 0.3 m in front: from the kinematic centre ahead is a little more, behind less
+    assert snapshot.distance_m[at(snapshot, 0.1)] == pytest.approx(OPEN_M + 0.3, abs=0.01)
+    assert OPEN_M - 0.3 < snapshot.distance_m[at(snapshot, 80.0)] < OPEN_M + 0.2
     # the field of view ends at 135 degrees from the laser: it leaves the body behind x = 0
     assert (snapshot.state[[at(snapshot, 112.0), at(snapshot, -112.0)]] == UNKNOWN).all()
 
@@ -235,7 +236,7 @@ def test_an_occluded_part_of_a_displaced_sector_is_not_free() -> None:
     shadow = snapshot.distance_m[at(snapshot, 2.5)]
     assert snapshot.state[at(snapshot, 2.5)] == FREE
     assert 4.4 < shadow < 4.78  # the shadow of 2.5 to 3 degrees meets the ray at 5 degrees first; its axis at 4.77 m
-    assert snapshot.distance_m[at(snapshot, -60.0)] > 20.0
+    assert snapshot.distance_m[at(snapshot, -60.0)] > 8.0
 
 
 def test_clearance_is_distance_less_the_border() -> None:
