@@ -13,8 +13,10 @@ from service.sensors import Laser, Ring, Sensor
 if TYPE_CHECKING:
     from mapping.planes.extract import PlaneRules
     from service.elevation_maker import ElevationMaker
+    from service.layers import BuildingLayer
     from service.map_makers import MapMaker
     from service.sector_ground import SectorGroundTeller
+    from service.wall_maker import WallMaker
 
 
 def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
@@ -75,6 +77,17 @@ def map_makers(config: Config, found: Mapping[str, Sensor]) -> list[MapMaker]:
     if config.agreement.enabled and config.grid.enabled:
         makers.extend(_agreement_maker(config, makers, lasers))
     return makers
+
+
+def wall_maker(config: Config, found: Mapping[str, Sensor], building: BuildingLayer | None) -> WallMaker | None:
+    """What shows the grid of the building by its walls; None if it is not wanted or no laser draws the grid."""
+    lasers = frozenset(name for name, sensor in found.items() if isinstance(sensor, Laser) and not sensor.tilts)
+    if building is None or not config.grid.crisp or not (fed_by := lasers & building.sources):
+        return None
+    from mapping.grids.live_walls import LiveWalls
+    from service.wall_maker import WallMaker
+
+    return WallMaker(LiveWalls(resolution_m=building.grid.resolution_m), fed_by, building.offer_walls)
 
 
 def _agreement_maker(config: Config, makers: Sequence[MapMaker], lasers: frozenset[str]) -> Iterator[MapMaker]:

@@ -25,12 +25,12 @@ I8 = NDArray[np.int8]
 Bools = NDArray[np.bool_]
 
 NAME = "clearance"
-_OCCUPIED_PERCENT = 65
+_OCCUPIED_PERCENT = 64  # also what is counted occupied and shown as undecided, beside a wall
 _CELL_NS = 1000  # a map of more than a million cells is told less often than once a second
 
 
 class ClearanceMaker:
-    """A map maker that keeps distances to what the grid calls occupied.
+    """A map maker that keeps distances to what the grid calls occupied, and to what it would by each cell alone.
 
     reach_m: farther away the cost is 0.  unknown_is_obstacle: distances also to what was never seen.
     Unknown cells stay unknown (-1), whatever lies beside them.

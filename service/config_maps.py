@@ -77,6 +77,10 @@ class Grid(Section):
     )
     publish_period_s: float = Field(default=1.0, ge=1.0, le=3600, description="Shortest time between two whole grids.")
     update_period_s: float = Field(default=0.2, ge=0.2, le=3600, description="Shortest time between two updates.")
+    crisp: bool = Field(
+        default=True,
+        description="Publish and export walls as lasers' sweeps together show them, not as each cell was counted.",
+    )
 
 
 class LocalGrid(Section):

@@ -171,6 +171,8 @@ class Daemon:
         finally:
             starting()  # what hindered it is told before a minute of compiling has passed
         makers = assemble_makers.map_makers(config, self._sensors)
+        walls = assemble_makers.wall_maker(config, self._sensors, maps.building)
+        makers += [] if walls is None else [walls]
         self._makers = MapMakers(makers, self._publisher.offer, now_ns=self._clock.now_ns)
         self._ground = assemble_makers.sector_ground(config, makers)
         if store is not None:
@@ -207,6 +209,7 @@ class Daemon:
             self._live_map = LiveMap(
                 maps.building, store, ask=self._worker.ask, fusion=self._fusion, makers=self._makers,
                 anchor=None if config.store.anchor is None else config.store.anchor.model_dump(),
+                settle_walls=(lambda: None) if walls is None else walls.settle,
             )  # fmt: skip
             self._publisher.calls.register_map_service(self._live_map)
             self._parts.callback(self._finish_map, self._live_map)

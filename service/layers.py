@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
@@ -30,6 +31,7 @@ _HALVINGS_MAX = 16  # nothing is left after so many
 _TOUCHED_SURELY = 0.7
 _TOUCHES_MAX = 300  # more than a cell can have been looked through
 _STILL_RAD = 2e-4  # 6 mm at 30 m
+_WALLS_WAITING_MAX = 4096
 
 
 def insert_sweep(grid: EvidenceGrid, scan: Scan, map_from_sensor: F64) -> None:
@@ -213,6 +215,16 @@ class BuildingLayer:
         self._update_ns = 0
         self._unsent = True  # something changed that no full grid holds yet
         self._outgrown = True  # something changed outside the last full grid
+        self._walls: deque[tuple[int, int, NDArray[np.uint8]]] = deque(maxlen=_WALLS_WAITING_MAX)
+
+    def offer_walls(self, tile_row: int, tile_col: int, walls: NDArray[np.uint8]) -> None:
+        """Walls of a tile, to be shown with the next outputs: see OccupancyGrid.show_walls. Any thread."""
+        self._walls.append((tile_row, tile_col, walls))
+
+    def show_walls(self) -> None:
+        """Show those that were offered by now."""
+        while self._walls:
+            self.grid.show_walls(*self._walls.popleft())
 
     def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
         self._forgetting.move_on(scan.stamp_ns)
@@ -229,6 +241,7 @@ class BuildingLayer:
         if self._full is not None and now_ns - self._update_ns < self._update_period_ns:
             return []
         self._update_ns = now_ns
+        self.show_walls()
         changes = self.grid.take_changes()
         self._unsent |= bool(changes)
         self._outgrown |= any(not self._is_inside(change) for change in changes)
@@ -238,6 +251,7 @@ class BuildingLayer:
 
     def start_anew(self) -> None:
         """The grid was replaced, or moved: what was sent so far no longer holds, the next output is a whole grid."""
+        self._walls.clear()
         self._full, self._unsent, self._outgrown = None, True, True
 
     def _is_full_due(self, now_ns: int) -> bool:

@@ -74,10 +74,12 @@ class LiveMap:
         fusion: Drawing,
         makers: MapMakers | None = None,
         anchor: Mapping[str, float] | None = None,
+        settle_walls: Callable[[], None] = lambda: None,
     ) -> None:
         """fusion: draws the grid, and knows where the robot is; touched where `ask` runs.  makers: kept too.
 
-        anchor: the map on the earth, as map files keep it; None: what the store says.
+        anchor: the map on the earth, as map files keep it; None: what the store says.  settle_walls: finds the walls of
+        the grid as it is now, before it is saved; run where makers are.
         """
         self._layer = layer
         self._store = store
@@ -86,6 +88,7 @@ class LiveMap:
         self._fusion = fusion
         self._makers = makers
         self._disk = threading.RLock()  # what is on it and the live map change together: no snapshot between
+        self._settle_walls = settle_walls
         self._anchor = store.get_meta(ANCHOR) if anchor is None and store is not None else anchor
 
     # --- while running
@@ -96,9 +99,7 @@ class LiveMap:
             return self._queue is None or self._write(self._queue)
 
     def _write(self, queue: SnapshotQueue) -> bool:
-        changed, pose, slam = self._ask(
-            lambda: (self._layer.grid.changed_tiles(), self._fusion.pose(), self._fusion.kept_of_slam())
-        )
+        changed, pose, slam = self._ask(self._changed)
         if slam is not None:
             queue.offer(SLAM, slam())
         if changed:
@@ -108,6 +109,10 @@ class LiveMap:
             if tiles:
                 queue.offer(name, tiles)
         return queue.commit()
+
+    def _changed(self) -> tuple[list[GridTile], Pose2 | None, Callable[[], list[Tile]] | None]:
+        self._layer.show_walls()
+        return self._layer.grid.changed_tiles(), self._fusion.pose(), self._fusion.kept_of_slam()
 
     def counters(self) -> dict[str, int]:
         """Commits and tiles written, and what failed."""
@@ -122,9 +127,14 @@ class LiveMap:
         self._ask(self._fusion.drain)
         if self._store is None:
             return
+        self._find_walls()
         if not self.snapshot():
             raise Trouble(self.trouble() or f"{self._store.path}: not saved")
         self._store.keep_generation()
+
+    def _find_walls(self) -> None:
+        if self._makers is not None:
+            self._makers.ask(self._settle_walls)
 
     def _meta(self, pose: Pose2 | None) -> dict[str, Any]:
         grid = self._layer.grid
@@ -144,6 +154,7 @@ class LiveMap:
         """Write the map now, under this name beside the live one."""
         store = self._needed_store()
         with self._disk:
+            self._find_walls()
             if not self.snapshot():
                 raise CallRefused(f"not saved: {self.trouble()}")
             return store.save_as(store.path.parent / f"{name}{SUFFIX}").document()
@@ -165,6 +176,7 @@ class LiveMap:
             raise CallRefused(f"{path}: holds no grid to go on with; `umfeld map import` makes one from a picture")
         self._check_tiles(path, tiles)
         with self._disk:
+            self._find_walls()
             if not self.snapshot():  # else older tiles would wait behind what is written next
                 raise CallRefused(f"not loaded: {self.trouble()}; the live map is as it was")
             kept = keep_replaced(store)
@@ -185,6 +197,7 @@ class LiveMap:
         """Keep the live map under this name, None: by the time, and begin an empty one where the robot stands."""
         store = self._needed_store()
         with self._disk:
+            self._find_walls()
             if not self.snapshot():
                 raise CallRefused(f"no new map is begun, since the old one cannot be kept: {self.trouble()}")
             answer = keep_and_empty(store, name, wall_ns=store.wall_ns())
@@ -282,5 +295,6 @@ def occupancy_of(changed: Iterable[GridTile]) -> list[Tile]:
         model: Model = tile.model
         alone = OccupancyGrid(resolution_m=tile.resolution_m, model=model, max_tiles=1)
         alone.load_tile(tile.tile_row, tile.tile_col, tile.payload())
+        alone.show_walls(tile.tile_row, tile.tile_col, tile.walls)
         found.extend(occupancy_tiles(alone.patch(whole_tiles=True), TILE, also_unknown=True))
     return found

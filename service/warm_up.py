@@ -112,6 +112,10 @@ def _steps(config: Config) -> dict[str, Step]:
         from service.room_maker import warm_up as warm_up_rooms
 
         steps["rooms"] = warm_up_rooms
+    if config.grid.enabled and config.grid.crisp and any(isinstance(sensor, Laser) for sensor in found.values()):
+        from mapping.grids.warm_up import warm_up_live_walls
+
+        steps["walls"] = warm_up_live_walls
     if config.localise.mode == "map":
         from mapping.localise.warm_up import warm_up_in_map
 

@@ -730,6 +730,8 @@ def for_log(
 ) -> Table:
     """A configuration in which only the laser and the wheels are left, as a recorded log knows them.
 
+    What the laser does not hear proves no free space: `umfeld map build` reads logs alike.
+
     mount: the log's laser.  rate_hz, wheel_m_s: how often wheels are asked, and how fast they may turn.
     """
     table = copy.deepcopy(dict(config))
@@ -747,6 +749,7 @@ def for_log(
         "yaw_deg": round(math.degrees(mount.yaw_rad), 6),
     }
     laser.pop("range_max_m", None)
+    laser["no_echo"] = "unknown"  # in a log it may be glass or a dark surface as well as nothing
     table["lasers"] = {name: laser}
     table.pop("sonars", None)
     table.pop("mounts", None)

@@ -26,6 +26,7 @@ from mapping.grids.patch import GridPatch
 from mapping.grids.sonar_model import SonarRules
 from mapping.grids.tiles import TILE, TO_PUBLISH, TO_STORE, TilePool, Window
 from mapping.kernels import grids as kernels
+from mapping.kernels import walls as wall_kernels
 
 __all__ = [
     "FREE",
@@ -50,6 +51,9 @@ TILE_MAGIC: Final = b"UGRT"
 TILE_VERSION: Final = 1
 MAX_TILE_ROW: Final = 1 << 33
 
+WALL_FROM_PERCENT: Final = 15  # a wall that the laser has all but looked away is shown no more
+BY_A_WALL_CELLS: Final = 2
+
 
 @dataclass(frozen=True, slots=True)
 class GridTile:
@@ -64,6 +68,7 @@ class GridTile:
     model: Model
     cells: U16
     sonar: U8 | None
+    walls: U8 | None = None  # as in OccupancyGrid.show_walls
 
     def payload(self) -> bytes:
         """Bytes for OccupancyGrid.load_tile; the same cells always give the same bytes."""
@@ -107,6 +112,7 @@ class OccupancyGrid(EvidenceGrid):
             use_max_m=use_max_m,
         )
         self._published: dict[int, I8] = {}
+        self._walls: dict[int, U8] = {}  # by slot: which cells are walls, packed, eight columns a byte
 
     # ------------------------------------------------------------------ publishing
 
@@ -165,7 +171,8 @@ class OccupancyGrid(EvidenceGrid):
         pool = self._pool
         tile_row, tile_col = (int(k) for k in pool.tile_at[slot])
         sonar = pool.sonar_of_slot(slot).copy() if pool.sonar_seen[slot] else None
-        return GridTile(tile_row, tile_col, self.resolution_m, self.model, pool.cells_of_slot(slot).copy(), sonar)
+        cells, walls = pool.cells_of_slot(slot).copy(), self._walls.get(slot)
+        return GridTile(tile_row, tile_col, self.resolution_m, self.model, cells, sonar, walls)
 
     def load_tile(self, tile_row: int, tile_col: int, payload: bytes) -> None:
         """Put a stored tile in its place, replacing what is there; it counts as changed for publishing only.
@@ -184,6 +191,7 @@ class OccupancyGrid(EvidenceGrid):
             self._pool.need_sonar()
             self._pool.sonar_of_slot(slot)[:] = 0 if sonar is None else sonar
             self._pool.sonar_seen[slot] = sonar is not None
+        self._walls.pop(slot, None)
         self._pool.flags[slot] |= ~TO_STORE & np.uint8(0xFF)
         self._pool.flags[slot] &= ~TO_STORE & np.uint8(0xFF)
 
@@ -262,6 +270,7 @@ class OccupancyGrid(EvidenceGrid):
                     other._pool.sonar_of_slot(source) if with_sonar and source is not None else 0
                 )
                 self._pool.sonar_seen[slot] = with_sonar
+            self._walls.pop(slot, None)
             self._pool.flags[slot] = 0xFF
 
     def call_occupied(self, cells: ArrayLike) -> tuple[int, int]:
@@ -295,8 +304,41 @@ class OccupancyGrid(EvidenceGrid):
         pool.cells[added] = least
         return len(added), lowered
 
+    def show_walls(self, tile_row: int, tile_col: int, walls: U8 | None) -> None:
+        """Publish and export a tile seen through the walls found in it; what its cells hold stays as counted.
+
+        walls: (TILE, TILE) 0 or 1, or as in GridTile; None: as counted. A wall that is WALL_FROM_PERCENT occupied or
+        more is shown occupied; an occupied cell that is no wall and has one shown within BY_A_WALL_CELLS, in this tile,
+        as just less. So no cell is shown freer than it was counted, but from occupied to undecided beside a wall that
+        is shown; what was not seen before is shown at once; and what the laser looks away goes. Sonars keep their say.
+        It lasts until the tile is loaded, taken or cleared. Nothing happens where there is no tile.
+        """
+        slot = int(self._pool.look_up(np.array([[tile_row, tile_col]], dtype=np.int64) * TILE)[0][0])
+        if slot == 0:
+            return
+        packed = None if walls is None or not walls.any() else walls
+        if packed is not None and packed.shape == (TILE, TILE):
+            packed = np.packbits(packed, axis=1)
+        before = self._walls.pop(slot, None)
+        if packed is not None:
+            self._walls[slot] = packed
+        if before is not packed and (before is None or packed is None or not np.array_equal(before, packed)):
+            self._pool.flags[slot] |= TO_PUBLISH | TO_STORE
+
+    def _tile_percent(self, slot: int, out: I8) -> None:
+        walls, pool = self._walls.get(slot), self._pool
+        if walls is None:
+            super()._tile_percent(slot, out)
+            return
+        wall_kernels.percent_by_walls(
+            slot, pool.cells, self._laser_percent, pool.sonar, bool(pool.sonar_seen[slot]), self._sonar_percent,
+            np.unpackbits(walls, axis=1), math.ceil(100.0 * self.rules.occupied_from), WALL_FROM_PERCENT,
+            BY_A_WALL_CELLS, out,
+        )  # fmt: skip
+
     def clear(self) -> None:
         """Forget everything; the next changes say so."""
+        self._walls.clear()
         for slot in self._pool.slots():
             self._pool.cells_of_slot(int(slot))[:] = 0
             if self._pool.sonar_seen[slot]:
@@ -307,6 +349,7 @@ class OccupancyGrid(EvidenceGrid):
         """Forget everything, the tiles as well; no change says so: whoever publishes sends the grid whole."""
         self._pool.drop_all()
         self._published.clear()
+        self._walls.clear()
 
 
 def trimmed(patch: GridPatch) -> GridPatch:

@@ -37,6 +37,7 @@ I64 = NDArray[np.int64]
 AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)], dtype=np.int64)
 EXPLAINED = np.array([(0, 0), (-1, 0), (0, -1), (0, 1), (1, 0)], dtype=np.int64)
 PIECE = 1 << 16
+FULL = 65535
 NEIGHBOURS = 2  # cells from an end whose counts matter: a wall may lie beside it, and is blurred over its neighbours
 HALF_A_BEAM = 0.5  # the cost of a cell that nothing passed
 
@@ -60,8 +61,15 @@ class WallRules:
             raise ValueError(f"blur_cells is above 0, at most 0.5, got {self.blur_cells}")
 
 
+def blur_weights(rules: WallRules) -> F64:
+    """(3, 3) shares of a count that belong to a cell and those around it."""
+    side = math.exp(-0.5 / rules.blur_cells**2)
+    weights = np.array([side, 1.0, side]) / (1.0 + 2.0 * side)
+    return np.outer(weights, weights)
+
+
 @dataclass(frozen=True, slots=True)
-class _Table:
+class TileTable:
     """Tiles by place: places (T, 2); index (R, C) which of them lies at (row0 + row, col0 + column), -1 none."""
 
     places: I64
@@ -70,14 +78,14 @@ class _Table:
     index: NDArray[np.int32]
 
     @staticmethod
-    def of(places: I64) -> _Table:
+    def of(places: I64) -> TileTable:
         """The table of tiles (T, 2), T may be 0."""
         row0, col0 = (int(k) for k in places.min(axis=0)) if len(places) else (0, 0)
         at = places - (row0, col0)
         rows, cols = (int(k) + 1 for k in at.max(axis=0)) if len(at) else (0, 0)
         index = np.full((rows, cols), -1, dtype=np.int32)
         index[at[:, 0], at[:, 1]] = np.arange(len(at))
-        return _Table(places, row0, col0, index)
+        return TileTable(places, row0, col0, index)
 
 
 class EndTiles:
@@ -85,7 +93,7 @@ class EndTiles:
 
     def __init__(self, grid: OccupancyGrid) -> None:
         self.resolution_m = grid.resolution_m
-        self._table = _Table.of(np.array(grid.places(), dtype=np.int64).reshape(-1, 2))
+        self._table = TileTable.of(np.array(grid.places(), dtype=np.int64).reshape(-1, 2))
         self._marked = np.zeros(len(self._table.places), dtype=np.bool_)
 
     def add(self, map_from_sensor: Pose2, bearing_rad: F64, range_m: F64, *, range_max_m: float) -> None:
@@ -112,16 +120,17 @@ class BeamCounts:
     def __init__(self, grid: OccupancyGrid, places: I64 | None = None) -> None:
         self.resolution_m = grid.resolution_m
         chosen = np.array(grid.places(), dtype=np.int64).reshape(-1, 2) if places is None else places
-        self._table = _Table.of(chosen)
+        self._table = TileTable.of(chosen)
         self._ends, self._passes = np.zeros((2, len(chosen) * TILE_CELLS), dtype=np.uint16)
 
     def add(self, map_from_sensor: Pose2, bearing_rad: F64, range_m: F64, *, range_max_m: float) -> None:
         """One sweep; bearing_rad, range_m: (N,) as in mapping.scan.Scan."""
         per_m, table = 1.0 / self.resolution_m, self._table
         bearing = np.asarray(bearing_rad, dtype=np.float64) + map_from_sensor.yaw_rad
+        from_x, from_y = np.array([[map_from_sensor.x_m], [map_from_sensor.y_m]]) * per_m
         kernels.count_beams(
-            map_from_sensor.x_m * per_m, map_from_sensor.y_m * per_m, bearing, np.array(range_m, dtype=np.float64),
-            per_m, float(range_max_m), table.row0, table.col0, table.index, self._ends, self._passes,
+            from_x, from_y, bearing, np.array(range_m, dtype=np.float64), per_m, float(range_max_m),
+            table.row0, table.col0, table.index, self._ends, self._passes, FULL,
         )  # fmt: skip
 
     def walls(self, rules: WallRules | None = None) -> I64:
@@ -130,9 +139,7 @@ class BeamCounts:
         cells = self._cells_near_ends()
         if len(cells) == 0:
             return cells
-        side = math.exp(-0.5 / rules.blur_cells**2)
-        weights = np.array([side, 1.0, side]) / (1.0 + 2.0 * side)
-        weight = np.outer(weights, weights).ravel()
+        weight = blur_weights(rules).ravel()
         ends, passes = (self._blurred(counts, cells, weight) for counts in (self._ends, self._passes))
         ended, passed = self._at(self._ends, cells), self._at(self._passes, cells)
         cost = np.where(ended > 0.0, passes + HALF_A_BEAM, np.inf)

@@ -10,6 +10,7 @@ from mapping.frames import Pose2
 from mapping.grids.beam_model import beams_of_scan
 from mapping.grids.clearance import DistanceField, clearance_layer
 from mapping.grids.evidence import Model
+from mapping.grids.live_walls import LiveWalls
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.walls import BeamCounts, EndTiles
 from mapping.kernels.beams import drop_own
@@ -54,3 +55,15 @@ def warm_up_walls() -> None:
     counts = BeamCounts(grid, ends.places())
     counts.add(Pose2(), bearing, ranges, range_max_m=2.0)
     grid.call_occupied(counts.walls())
+
+
+def warm_up_live_walls(model: Model = "counters") -> None:
+    """What a daemon needs that shows its grid by the walls in it."""
+    grid, walls = OccupancyGrid(model=model, max_tiles=16), LiveWalls(resolution_m=0.05)
+    bearing, ranges = np.linspace(-1.0, 1.0, 9), np.ones(9)
+    grid.insert_scan(Pose2(), bearing, ranges, range_max_m=2.0)
+    for pose in (np.zeros(3), np.zeros((9, 3))):
+        walls.add(pose, bearing, ranges, range_max_m=2.0)
+    for row, col in walls.places:
+        grid.show_walls(row, col, walls.judge((row, col)))
+    grid.patch()

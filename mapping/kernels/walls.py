@@ -13,9 +13,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from mapping.kernels.grids import TILE_BITS, TILE_MASK
-
-FULL = 65535
+from mapping.kernels.grids import TILE, TILE_BITS, TILE_MASK
 
 
 @njit(cache=True, nogil=True)
@@ -40,18 +38,20 @@ def mark_ends(
 
 @njit(cache=True, nogil=True)
 def count_beams(
-    ox: float, oy: float, bearing: Any, range_m: Any, per_m: float, range_max_m: float, row0: int, col0: int,
-    index: Any, ends: Any, passes: Any,
+    from_x: Any, from_y: Any, bearing: Any, range_m: Any, per_m: float, range_max_m: float, row0: int, col0: int,
+    index: Any, ends: Any, passes: Any, full: int,
 ) -> None:  # fmt: skip
     """Count every beam with an end: one end where it ends, one pass in each cell that it crosses before.
 
-    ox, oy: the sensor, in cells.  bearing: (N,) in the map.  ends, passes: (cells of all tiles,) counts, added to.
-    Where one of both has reached FULL both are halved: what counts is how many ends there are to a pass.
+    from_x, from_y: (N,) where the sensor was at each beam, or (1,) at all, in cells.  bearing: (N,) in the map.
+    ends, passes: (cells of all tiles,) counts, added to. Where one of both has reached full both are halved: what
+    counts is how many ends there are to a pass.
     Beams without echo, too close or not measured count nowhere, nor does what lies where no tile is.
     """
     for i in range(range_m.size):
         if not 0.0 <= range_m[i] <= range_max_m:  # catches NaN and infinities
             continue
+        ox, oy = from_x[min(i, from_x.size - 1)], from_y[min(i, from_y.size - 1)]
         length = range_m[i] * per_m
         x, y = ox + length * math.cos(bearing[i]), oy + length * math.sin(bearing[i])
         col, row = math.floor(ox), math.floor(oy)
@@ -67,7 +67,7 @@ def count_beams(
                 tile = np.int64(index[table_row, table_col])
                 if tile >= 0:
                     at = (tile << (2 * TILE_BITS)) + ((row & TILE_MASK) << TILE_BITS) + (col & TILE_MASK)
-                    if ends[at] == FULL or passes[at] == FULL:
+                    if ends[at] >= full or passes[at] >= full:
                         ends[at] >>= 1
                         passes[at] >>= 1
                     if cols_left + rows_left == 0:
@@ -122,3 +122,83 @@ def cover(near: Any, ends: Any, cost: Any, least: float, chosen: Any) -> None:
         for j in range(near.shape[1]):
             if near[k, j] >= 0:
                 left[near[k, j]] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def judge_window(ends: Any, passes: Any, weight: Any, rule: Any, half_a_beam: float, wall: Any) -> None:
+    """Which cells of a rectangle are walls, as BeamCounts.walls says it, what lies outside not being known.
+
+    ends, passes: (R, C) counts.  weight: (3, 3) of a cell and those around it.  rule: ends_per_pass, surely_per_pass.
+    wall: (R, C) bool, written; its outermost rows and columns are none.
+    """
+    rows, cols = ends.shape
+    number = np.full((rows, cols), -1, dtype=np.int32)
+    count = 0
+    for row in range(1, rows - 1):
+        for col in range(1, cols - 1):
+            wall[row, col] = False
+            if np.any(ends[row - 1 : row + 2, col - 1 : col + 2]):
+                number[row, col] = count
+                count += 1
+    near = np.empty((count, 5), dtype=np.int32)
+    ended, cost = np.zeros(count), np.zeros(count)
+    for row in range(1, rows - 1):
+        for col in range(1, cols - 1):
+            k = number[row, col]
+            if k < 0:
+                continue
+            passed = 0.0
+            for i in range(3):
+                for j in range(3):
+                    ended[k] += weight[i, j] * ends[row + i - 1, col + j - 1]
+                    passed += weight[i, j] * passes[row + i - 1, col + j - 1]
+            cost[k] = passed + half_a_beam if ends[row, col] > 0 else np.inf
+            near[k, 0], near[k, 1], near[k, 2] = k, number[row - 1, col], number[row, col - 1]
+            near[k, 3], near[k, 4] = number[row, col + 1], number[row + 1, col]
+    chosen = np.zeros(count, dtype=np.bool_)
+    cover(near, ended, cost, rule[0], chosen)
+    for row in range(1, rows - 1):
+        for col in range(1, cols - 1):
+            if ends[row, col] > 0:
+                surely = ends[row, col] >= rule[1] * (passes[row, col] + half_a_beam)
+                wall[row, col] = surely or chosen[number[row, col]]
+
+
+@njit(cache=True, nogil=True)
+def percent_by_walls(
+    slot: int, cells: Any, laser_percent: Any, sonar: Any, with_sonar: bool, sonar_percent: Any, wall: Any,
+    occupied: int, least: int, reach: int, out: Any,
+) -> None:  # fmt: skip
+    """(T, T) int8 of one tile as published, what the laser says seen through the walls that were found in it.
+
+    wall: (T, T) 0 or 1.  A wall that the laser calls at least `least` per cent occupied is shown as `occupied`; what it
+    calls occupied, is no wall and has one shown within `reach` cells, in this tile, is shown as just less than that.
+    The sonar layer speaks as in percent_of_tile.
+    """
+    base = slot << (2 * TILE_BITS)
+    for row in range(TILE):
+        for col in range(TILE):
+            out[row, col] = laser_percent[cells[base + (row << TILE_BITS) + col]]
+    for row in range(TILE):
+        for col in range(TILE):
+            value = out[row, col]
+            if wall[row, col]:
+                if least <= value < occupied:
+                    out[row, col] = occupied
+            elif value >= occupied and _is_by_a_wall(row, col, out, wall, least, reach):
+                out[row, col] = occupied - 1
+    if with_sonar:
+        for row in range(TILE):
+            for col in range(TILE):
+                other = sonar_percent[sonar[base + (row << TILE_BITS) + col]]
+                if out[row, col] < 0 or (other >= occupied and other > out[row, col]):
+                    out[row, col] = other
+
+
+@njit(cache=True, nogil=True)
+def _is_by_a_wall(row: int, col: int, percent: Any, wall: Any, least: int, reach: int) -> bool:
+    for i in range(max(0, row - reach), min(TILE, row + reach + 1)):
+        for j in range(max(0, col - reach), min(TILE, col + reach + 1)):
+            if wall[i, j] and percent[i, j] >= least:
+                return True
+    return False

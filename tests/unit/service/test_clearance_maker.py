@@ -22,7 +22,7 @@ Cells = NDArray[np.int8]
 def random_cells(seed: int, shape: tuple[int, int] = (60, 90)) -> Cells:
     rng = np.random.default_rng(seed)
     return rng.choice(
-        np.array([-1, 0, 30, 64, 65, 100], dtype=np.int8), size=shape, p=[0.3, 0.6, 0.08, 0.01, 0.005, 0.005]
+        np.array([-1, 0, 30, 63, 64, 100], dtype=np.int8), size=shape, p=[0.3, 0.6, 0.08, 0.01, 0.005, 0.005]
     )
 
 
@@ -44,7 +44,7 @@ def told(maker: ClearanceMaker, patch: GridPatch, *changed: Rect) -> GridOut:
 def expected(patch: GridPatch, *, unknown_is_obstacle: bool = False) -> Cells:
     """Literally: the distance to the nearest obstacle, as a share of the reach."""
     wide = np.pad(patch.cells, 1, constant_values=-1)
-    obstacle = (wide >= 65) | ((wide < 0) & unknown_is_obstacle)
+    obstacle = (wide >= 64) | ((wide < 0) & unknown_is_obstacle)
     distance_m = CELL_M * distance_transform_edt(~obstacle)[1:-1, 1:-1]
     cost = np.ceil(np.round(100.0 * (1.0 - distance_m / REACH_M), 9)).clip(0, 100)
     return np.where(patch.cells < 0, -1, cost).astype(np.int8)
@@ -62,7 +62,7 @@ def in_frame(output: GridOut, patch: GridPatch) -> Cells:
 @pytest.mark.parametrize("unknown_is_obstacle", [False, True])
 def test_costs_are_those_of_the_exact_distances(unknown_is_obstacle: bool) -> None:
     patch = grid(random_cells(1))
-    patch.cells[10:40, 10:60] = np.where(patch.cells[10:40, 10:60] >= 65, 100, 0)
+    patch.cells[10:40, 10:60] = np.where(patch.cells[10:40, 10:60] >= 64, 100, 0)
     maker = ClearanceMaker(reach_m=REACH_M, unknown_is_obstacle=unknown_is_obstacle)
     want = expected(patch, unknown_is_obstacle=unknown_is_obstacle)
     np.testing.assert_array_equal(in_frame(told(maker, patch), patch), want)
@@ -70,7 +70,7 @@ def test_costs_are_those_of_the_exact_distances(unknown_is_obstacle: bool) -> No
 
 def test_a_distance_taken_back_from_its_cost_is_never_too_far_and_hardly_too_near() -> None:
     patch = grid(random_cells(2))
-    obstacle = patch.cells >= 65
+    obstacle = patch.cells >= 64
     distance_m = CELL_M * distance_transform_edt(~obstacle)
     cost = in_frame(told(ClearanceMaker(reach_m=REACH_M), patch), patch)
     back_m = (1.0 - cost / 100.0) * REACH_M
