@@ -29,7 +29,8 @@ STEP_RAD = math.radians(5.0)
 PERIOD_NS = 2_000_000_000
 ALL_PERIOD_NS = 10_000_000_000  # so often every tile is judged that was given any beam
 SHARE = 0.25  # of new beams in a tile: then it is judged before
-AT_ONCE = 48  # tiles, some 0.7 ms each
+AT_ONCE = 48  # tiles, some 0.5 ms each
+BEAMS_MOST = 720  # of one sweep: of finer ones every second, third ... is counted, others of the next
 
 
 class WallMaker:
@@ -42,6 +43,7 @@ class WallMaker:
         self._walls = walls
         self._tell = tell
         self._last: dict[str, F64] = {}
+        self._counted = 0
         self._all_ns: int | None = None
         self._told: set[tuple[int, int]] = set()  # tiles that have walls
         self._unkept: set[tuple[int, int]] = set()
@@ -57,7 +59,11 @@ class WallMaker:
             if way < STEP_M and abs(wrap_angle(float(middle[2] - last[2]))) < STEP_RAD:
                 return
         self._last[source] = middle.copy()
-        self._walls.add(map_from_sensor, scan.bearing_rad, scan.range_m, range_max_m=scan.range_max_m)
+        apart = math.ceil(len(scan.range_m) / BEAMS_MOST)
+        self._counted += 1
+        some = slice(self._counted % apart, None, apart)
+        poses = pose if len(pose) == 1 else pose[some]
+        self._walls.add(poses, scan.bearing_rad[some], scan.range_m[some], range_max_m=scan.range_max_m)
 
     def start_anew(self) -> None:
         """The map was corrected: every sweep that was kept follows, where it lies now."""

@@ -18,7 +18,7 @@ from service.live_map import GRID, LiveMap, restore
 from service.map_makers import MapMakers, MapView, Tile
 from service.outputs import GridOut, GridUpdateOut, Output
 from service.store import OCCUPANCY, MapStore, occupancy_patch
-from service.wall_maker import ALL_PERIOD_NS, PERIOD_NS, STEP_M, STEP_RAD, WallMaker
+from service.wall_maker import ALL_PERIOD_NS, BEAMS_MOST, PERIOD_NS, STEP_M, STEP_RAD, WallMaker
 
 F64 = NDArray[np.float64]
 SECOND = 1_000_000_000
@@ -69,6 +69,15 @@ def test_a_sweep_that_ends_nowhere_makes_no_step() -> None:
         maker.take_sweep("front", blind, np.zeros(3))
     maker.take_sweep("front", sweep(), np.array([0.01, 0.0, 0.0]))
     assert beams(walls) == len(BEARING)
+
+
+def test_of_fine_sweeps_every_second_beam_counts_and_the_others_of_the_next() -> None:
+    maker, walls = maker_of()
+    bearing = np.linspace(-1.0, 1.0, BEAMS_MOST + 1)
+    sure = Scan(7, 0.0, bearing, 2.03 / np.cos(bearing), 0.05, 10.0)
+    for k in range(2):
+        maker.take_sweep("front", sure, np.array([1.0 * k, 0.0, 0.0]) if k else np.zeros((len(bearing), 3)))
+    assert beams(walls) == len(bearing)
 
 
 def test_it_judges_tiles_with_many_new_beams_at_once_and_the_others_in_time() -> None:
