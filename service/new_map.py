@@ -25,15 +25,16 @@ def keep_and_empty(store: MapStore, name: str | None, *, wall_ns: int) -> dict[s
     name: None is one made of the time.  wall_ns: now.  StoreTrouble, with the map as it was, if it cannot be kept; a
     name that is there already is not replaced. A map with nothing in it is not kept.
     """
-    kept = None
+    kept: dict[str, Any] | None = None
     if any(store.layers().values()):
         path = _path_of(store.path, name, wall_ns)
         kept = {"name": path.stem, **_saved(store, path).document()}
     try:
         store.snapshot(dict.fromkeys(store.layers(), ()), _GONE_WITH_THE_MAP, replace=True)
     except StoreNotWritten as trouble:
-        already = "" if kept is None else f" (a copy of it is in {kept['path']})"
-        raise StoreTrouble(f"the old map goes on{already}: {trouble}") from trouble
+        if kept is not None:  # a copy of what goes on: it would only take what little room there is, and the name
+            Path(kept["path"]).unlink(missing_ok=True)
+        raise StoreTrouble(f"the old map goes on: {trouble}") from trouble
     try:
         store.keep_generation()  # else a file that breaks would be replaced by the map of another place
     except StoreNotWritten as trouble:

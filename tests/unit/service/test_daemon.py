@@ -480,6 +480,7 @@ def test_a_full_disk_lets_the_old_map_go_on(store: MapStore, monkeypatch: pytest
         with pytest.raises(Trouble, match="free some space"):
             keeper.load("kitchen")
     np.testing.assert_array_equal(layer.grid.patch().cells, before)
+    assert names_beside(store) <= {"live", "kitchen", "replaced"}, "no copy is left of a map that goes on"
     keeper.snapshot()
     np.testing.assert_array_equal(occupancy_patch(store).cells, before)
 
