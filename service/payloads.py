@@ -622,7 +622,7 @@ def _status_of(source: SourceHealth) -> cdr.Status:
 
 # The sector documents go out at up to 40 Hz each: what never changes is kept ready, the rest is compiled.
 
-_POLAR_FIELDS = (("bearing_rad", 5), ("distance_m", 4), ("clearance_m", 4), ("age_s", 3))
+_POLAR_FIELDS = (("bearing_rad", 5), ("distance_m", 4), ("clearance_m", 4), ("age_s", 3), ("free_m", 4))
 _RECT_FIELDS = (("x_m", 4), ("y_m", 4), ("distance_m", 4), ("age_s", 3))
 _NO_ROOM = 64  # for what is counted elsewhere
 
@@ -707,7 +707,8 @@ class SectorForm:
 
 
 def _polar_document(snap: PolarSnapshot, form: SectorForm, ground: SectorGround | None, stamp_ns: int) -> bytes:
-    columns = np.array((snap.bearing_rad, snap.distance_m, snap.clearance_m, _seconds(snap.age_ns)))
+    free_m = _nan_like(snap.distance_m) if snap.free_m is None else snap.free_m
+    columns = np.array((snap.bearing_rad, snap.distance_m, snap.clearance_m, _seconds(snap.age_ns), free_m))
     return form.document(stamp_ns, snap.state, columns, snap.source, ground)
 
 
@@ -716,6 +717,10 @@ def _rect_document(snap: RectSnapshot, form: SectorForm, stamp_ns: int) -> bytes
     x, y = known.x_m.ravel(), known.y_m.ravel()
     columns = np.array((x, y, np.hypot(x, y), _seconds(known.age_ns.ravel())))
     return form.document(stamp_ns, known.state.ravel(), columns, known.source.ravel())
+
+
+def _nan_like(values: F64) -> F64:
+    return np.full(len(values), np.nan)
 
 
 def _seconds(age_ns: I64) -> F64:

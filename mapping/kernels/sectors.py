@@ -284,17 +284,17 @@ def nearer_than_both(obstacle: Any, first: Any, second: Any) -> Any:
 def judge(
     obstacle: Any, u: Any, v: Any, free: Any, blind: Any, stamp: Any, fresh: Any, source: Any, all_heard: bool,
     now_ns: int, states: Any,
-) -> tuple[Any, Any, Any, Any, Any, Any]:  # fmt: skip
+) -> tuple[Any, Any, Any, Any, Any, Any, Any]:  # fmt: skip
     """What the findings (F, N) of all channels come to for each of N sectors; the rules: mapping/sectors/evidence.py.
 
     stamp, fresh: (F, N).  source: (F,).  states: values of OBSTACLE, FREE, UNKNOWN, STALE.  Returns (N,) state,
-    distance, u, v, age and source as in Verdict. Of equals the first finding counts.
+    distance, u, v, age, source and free as in Verdict. Of equals the first finding counts.
     """
     rows, count = obstacle.shape
     is_obstacle, is_free, is_unknown, is_stale = states
     state = np.full(count, is_unknown, dtype=np.int8)
     distance, at_u, at_v = np.full(count, math.nan), np.full(count, math.nan), np.full(count, math.nan)
-    age, of = np.full(count, -1, dtype=np.int64), np.full(count, -1, dtype=np.int16)
+    age, of, all_free = np.full(count, -1, dtype=np.int64), np.full(count, -1, dtype=np.int16), np.zeros(count)
     for sector in range(count):
         nearest, seen, old, any_near = math.inf, 0.0, math.inf, math.inf
         at_nearest, at_seen, at_old, at_any = 0, 0, 0, 0
@@ -319,16 +319,18 @@ def judge(
             state[sector], shown, at, decides = is_stale, any_near, at_any, at_old
         elif nearest < math.inf:
             state[sector], shown, decides = is_obstacle, nearest, at_nearest
+            if not is_blind and all_heard:
+                all_free[sector] = min(seen, nearest)
         elif seen > 0.0 and not is_blind and all_heard:
             state[sector], decides = is_free, at_seen
-            distance[sector] = seen
+            distance[sector] = all_free[sector] = seen
         if decides < 0:
             continue
         if shown < math.inf:
             distance[sector], at_u[sector], at_v[sector] = shown, u[at, sector], v[at, sector]
         age[sector] = max(now_ns - stamp[decides, sector], 0)
         of[sector] = source[decides]
-    return state, distance, at_u, at_v, age, of
+    return state, distance, at_u, at_v, age, of, all_free
 
 
 @njit(cache=True)

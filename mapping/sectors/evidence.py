@@ -125,6 +125,7 @@ class Verdict:
     v: F64
     age_ns: I64
     source: I16
+    free_m: F64
 
 
 class _Table:
@@ -274,7 +275,7 @@ def _judged(
         return Verdict(*kernels.judge(*table.columns(rows, now_ns, limits), all_heard, now_ns, _STATES))
     nan, none = np.full(count, np.nan), np.full(count, -1, dtype=np.int64)
     state = np.full(count, SectorState.UNKNOWN, dtype=np.int8)
-    return Verdict(state, nan, nan.copy(), nan.copy(), none, none.astype(np.int16))
+    return Verdict(state, nan, nan.copy(), nan.copy(), none, none.astype(np.int16), np.zeros(count))
 
 
 def _hold(new: _Channel, old: _Channel, looked: Looked) -> None:

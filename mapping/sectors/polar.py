@@ -199,6 +199,7 @@ class PolarSectors:
             age_ns=known.age_ns,
             source=known.source,
             sources=self._evidence.sources,
+            free_m=known.free_m,
         )
 
 

@@ -37,6 +37,8 @@ class PolarSnapshot:
     vehicle's outline along that bearing, or its largest in a FREE sector (NaN where distance_m is).
     age_ns: (N,) since the evidence that decided the state, -1 none.
     source: (N,) index into sources, -1 none.
+    free_m: (N,) up to which all of the sector was seen free by one source, also before an OBSTACLE; 0 nowhere, and
+    where the state is UNKNOWN or STALE. None: not told.
     """
 
     stamp_ns: int
@@ -49,6 +51,7 @@ class PolarSnapshot:
     age_ns: I64
     source: I16
     sources: tuple[str, ...]
+    free_m: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -431,3 +431,52 @@ def test_no_beams_at_all_is_no_knowledge() -> None:
     sectors = laser_map()
     sweep(sectors, np.empty(0), bearing=np.empty(0))
     assert (sectors.snapshot(0).state == UNKNOWN).all()
+
+
+# --- how far all of a sector was looked through
+
+
+def told_free(snapshot: PolarSnapshot, degrees: float) -> tuple[SectorState, float, float]:
+    assert snapshot.free_m is not None
+    sector = at(snapshot, degrees)
+    return SectorState(snapshot.state[sector]), float(snapshot.distance_m[sector]), float(snapshot.free_m[sector])
+
+
+def test_an_obstacle_in_a_sector_that_was_seen_whole_is_told_from_one_that_was_not() -> None:
+    sectors, reach = laser_map(), np.full(len(BEARING), 4.0)
+    reach[(math.radians(2.0) < BEARING) & (math.radians(3.0) > BEARING)] = 2.0
+    sweep(sectors, reach)
+    state, distance_m, free_m = told_free(sectors.snapshot(0), 2.5)
+    assert state == OBSTACLE
+    assert distance_m == pytest.approx(2.0)
+    assert free_m == pytest.approx(2.0, abs=0.05)
+    reach[(math.radians(3.4) < BEARING) & (math.radians(4.6) > BEARING)] = np.nan  # came back with nothing to go by
+    sweep(sectors, reach, stamp_ns=1)
+    state, distance_m, free_m = told_free(sectors.snapshot(1), 2.5)
+    assert (state, free_m) == (OBSTACLE, 0.0)
+    assert distance_m == pytest.approx(2.0)
+    assert told_free(sectors.snapshot(1), 12.5)[2] == pytest.approx(4.0, abs=0.1), "the sectors beside were seen"
+
+
+def test_a_sonar_that_covers_part_of_a_sector_looked_through_none_of_it() -> None:
+    sectors = PolarSectors(sources=("sonar",), sector_rad=math.radians(60.0), stale_after_ns=LIMIT_NS)
+    ping(sectors, 1.0)
+    state, _, free_m = told_free(sectors.snapshot(0), 0.5)
+    assert (state, free_m) == (OBSTACLE, 0.0)
+
+
+def test_what_is_told_free_is_never_beyond_the_obstacle_nor_stale() -> None:
+    sectors, rng = laser_map(), np.random.default_rng(7)
+    for stamp in range(20):
+        reach = rng.uniform(0.3, 6.0, len(BEARING))
+        reach[rng.random(len(BEARING)) < 0.2] = np.inf
+        reach[rng.random(len(BEARING)) < 0.01] = np.nan
+        sweep(sectors, reach, stamp_ns=stamp)
+        snapshot = sectors.snapshot(stamp)
+        assert snapshot.free_m is not None
+        seen = np.isin(snapshot.state, (OBSTACLE, FREE))
+        assert (snapshot.free_m[seen] <= snapshot.distance_m[seen] + 1e-9).all()
+        assert (snapshot.free_m[~seen] == 0.0).all()
+    old = sectors.snapshot(10 * LIMIT_NS)
+    assert old.free_m is not None
+    assert not old.free_m.any()

@@ -59,6 +59,7 @@ def polar(count: int, seed: int = 0) -> PolarSnapshot:
         np.where(unknown, -1, rng.integers(0, 10**9, count)),
         np.where(unknown, -1, 0).astype(np.int16),
         ('a "quoted" name',),
+        rng.uniform(0, 5, count),
     )
 
 
@@ -150,6 +151,8 @@ def test_polar_document_says_what_the_snapshot_says(count: int, seed: int) -> No
             assert sector[key] == (None if math.isnan(values[i]) else pytest.approx(values[i], abs=1e-4))
         age = snapshot.age_ns[i]
         assert sector["age_s"] == (None if age < 0 else pytest.approx(age / 1e9, abs=1e-3))
+        assert snapshot.free_m is not None
+        assert sector["free_m"] == pytest.approx(snapshot.free_m[sector["index"]], abs=1e-4)
         assert sector["source"] == (None if snapshot.source[i] < 0 else snapshot.sources[0])
 
 
