@@ -190,11 +190,12 @@ def maps(config: Config, found: Mapping[str, Sensor]) -> Maps:
 
 def _known_map(config: Config, found: Mapping[str, Sensor]) -> KnownMapLayer:
     """The given map of [localise]. Trouble if its file cannot be read."""
-    from service.map_localiser import KnownMapLayer, read_map
+    from service.map_localiser import KnownMapLayer, read_map, seen_by_lasers
 
     lasers = frozenset(name for name, sensor in found.items() if isinstance(sensor, Laser) and not sensor.tilts)
     path = Path(config.localise.map or "").expanduser()
-    return KnownMapLayer(read_map(path), lasers & sources_of(config, config.localise.sources, found), name=path.name)
+    patch, sources = read_map(path), lasers & sources_of(config, config.localise.sources, found)
+    return KnownMapLayer(patch, sources, name=path.name, seen=seen_by_lasers(path, patch))
 
 
 def tilting_lasers(config: Config) -> tuple[TiltingLaser, ...]:
@@ -337,7 +338,9 @@ def localiser(
 
         known = next(layer for layer in made.grids if isinstance(layer, KnownMapLayer))
         start = None if config.localise.start is None else pose_of(config.localise.start)
-        return KnownMapLocaliser(known.patch, known.sources, submit=submit, start=start, name=known.name)
+        return KnownMapLocaliser(
+            known.seen, known.sources, submit=submit, start=start, name=known.name, published=known.patch
+        )
     matched = lasers.keys() & sources_of(config, config.slam.sources, found)
     if not config.slam.enabled or not matched:
         return OdometryOnly(start_pose)

@@ -21,7 +21,7 @@ from mapping.localise.known_map import BEAMS, FARTHEST_M, KnownMap, digest_of, k
 from service.errors import WrongUsage
 from service.export import pixels_of
 from service.files import Receipt, write_whole
-from service.map_localiser import fields_of, read_map
+from service.map_localiser import fields_of, read_map, seen_by_lasers
 from service.recording_log import read_any_log
 
 Progress = Callable[[int, int], None]
@@ -74,7 +74,8 @@ def localise_log(
     if not scans:
         raise WrongUsage(f"{log_path}: holds no laser scan")
     patch = read_map(map_path)
-    known = prepared(patch, map_path)
+    digest = digest_of(patch)
+    known = prepared(seen_by_lasers(map_path, patch), map_path)
     localiser = MapLocaliser(known, settings, start=start)
     mount = Pose2(*log.robot_from_laser)
     located: list[Located] = []
@@ -95,7 +96,7 @@ def localise_log(
             progress(index, len(scans))
     seconds = time.thread_time() - began
     return LocalisedLog(
-        log, scans, patch, tuple(located), localiser.events, seconds, known.digest, digest_of(patch)
+        log, scans, patch, tuple(located), localiser.events, seconds, digest, digest_of(patch)
     )  # fmt: skip
 
 

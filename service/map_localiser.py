@@ -24,7 +24,7 @@ from mapping.frames import IDENTITY, Pose2, compose_covariance
 from mapping.grids.patch import GridPatch
 from mapping.localise.in_map import Located as Placed
 from mapping.localise.in_map import MapLocaliser, Search, SearchResult, State
-from mapping.localise.known_map import BEAMS, FARTHEST_M, known_map, points_of
+from mapping.localise.known_map import BEAMS, FARTHEST_M, digest_of, known_map, points_of
 from mapping.odometry import OdometryState
 from mapping.pose_buffer import PoseBuffer
 from mapping.scan import Scan
@@ -44,6 +44,8 @@ _SCAN_GAP_NS = 40_000_000  # scans of a fast laser that come sooner say nothing 
 _TELL_NS = 200_000_000
 _REPUBLISH_NS = 5_000_000_000
 _NEAREST_M = 0.05
+_OCCUPIED = 65  # percent, as map servers have it
+_DOUBTFUL = 50
 _ANYWHERE: F64 = np.diag([1e6, 1e6, math.pi**2])
 
 
@@ -60,12 +62,52 @@ def read_map(path: Path) -> GridPatch:
         return occupancy_patch(store)
 
 
+def seen_by_lasers(path: Path, patch: GridPatch) -> GridPatch:
+    """A map as lasers know it: what sonars alone heard (glass, table tops, edges) is taken out where it is told apart.
+
+    A laser looks through it, and the robot would be told lost where much of it stands. patch: what read_map gives.
+    """
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return patch
+    from mapping.grids.occupancy import OccupancyGrid
+    from service.live_map import GRID
+    from service.store import MapStore
+
+    with MapStore.open(path, wall_ns=lambda: 0, read_only=True) as store:
+        made_with, tiles = store.get_meta(GRID), store.load_tiles(GRID)
+    if not made_with or not tiles or made_with["resolution_m"] != patch.resolution_m:
+        return patch
+    grid = OccupancyGrid(resolution_m=made_with["resolution_m"], model=made_with["model"], max_tiles=len(tiles))
+    try:
+        for row, column, payload in tiles:
+            grid.load_tile(row, column, payload, sonars=False)
+    except ValueError as error:
+        log.warning("%s: used as it is, sonars' obstacles among lasers': %s", path, error)
+        return patch
+    seen = _laid_on(grid.patch(), patch)
+    return replace(patch, cells=np.where((patch.cells >= _OCCUPIED) & (seen < _DOUBTFUL), seen, patch.cells))
+
+
+def _laid_on(one: GridPatch, other: GridPatch) -> NDArray[np.int8]:
+    """The cells of one where the other's are; unknown where it has none."""
+    cells = np.full(other.cells.shape, -1, dtype=np.int8)
+    row, col = one.row0 - other.row0, one.col0 - other.col0
+    rows, cols = one.cells.shape
+    target = cells[max(row, 0) : max(row + rows, 0), max(col, 0) : max(col + cols, 0)]
+    target[:] = one.cells[max(-row, 0) :, max(-col, 0) :][: target.shape[0], : target.shape[1]]
+    return cells
+
+
 class KnownMapLayer:
     """The known grid as fusion sees it: sweeps go by it (so that they reach the localiser), none is drawn."""
 
-    def __init__(self, patch: GridPatch, sources: Iterable[str], *, name: str = "map") -> None:
+    def __init__(
+        self, patch: GridPatch, sources: Iterable[str], *, name: str = "map", seen: GridPatch | None = None
+    ) -> None:
+        """seen: the map as lasers know it, where that is another; patch is what is published."""
         self.name = name
         self.patch = patch
+        self.seen = patch if seen is None else seen
         self.sources = frozenset(sources)
         self._told_ns: int | None = None
 
@@ -90,9 +132,18 @@ class KnownMapLocaliser:
     """See the module's docstring and fusion.Localiser."""
 
     def __init__(
-        self, patch: GridPatch, sources: Iterable[str], *, submit: Submit, start: Pose2 | None = None, name: str = "map"
+        self,
+        patch: GridPatch,
+        sources: Iterable[str],
+        *,
+        submit: Submit,
+        start: Pose2 | None = None,
+        name: str = "map",
+        published: GridPatch | None = None,
     ) -> None:
-        """sources: lasers that are matched.  start: a hint where the robot is.  name: of the map, for people.
+        """patch: the map as lasers know it.  sources: lasers that are matched.  start: a hint where the robot is.
+
+        name: of the map, for people.  published: the whole map, whose sum is told, if that is another.
 
         Raises Trouble if the map cannot be localised in.
         """
@@ -100,6 +151,7 @@ class KnownMapLocaliser:
             self._known = known_map(patch)
         except ValueError as error:
             raise Trouble(f"{name}: {error}") from error
+        self._digest = self._known.digest if published is None else digest_of(published)
         self._name = name
         self._sources = frozenset(sources)
         self._submit = submit
@@ -207,7 +259,7 @@ class KnownMapLocaliser:
     def fields(self) -> dict[str, object]:
         """What is known, as JSON values: the document umfeld.localisation.v1 without frame and stamp."""
         placed = self._placed or self._localiser.located(0)
-        return {**fields_of(placed), "map": {"name": self._name, "sha256": self._known.digest}}
+        return {**fields_of(placed), "map": {"name": self._name, "sha256": self._digest}}
 
     def search_for(self, arguments: Mapping[str, Any]) -> Search | None:
         """The search that a call asks for, to be run outside the fusion thread; it changes nothing here.

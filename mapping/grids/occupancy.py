@@ -174,13 +174,15 @@ class OccupancyGrid(EvidenceGrid):
         cells, walls = pool.cells_of_slot(slot).copy(), self._walls.get(slot)
         return GridTile(tile_row, tile_col, self.resolution_m, self.model, cells, sonar, walls)
 
-    def load_tile(self, tile_row: int, tile_col: int, payload: bytes) -> None:
+    def load_tile(self, tile_row: int, tile_col: int, payload: bytes, *, sonars: bool = True) -> None:
         """Put a stored tile in its place, replacing what is there; it counts as changed for publishing only.
 
+        sonars: with what they heard as well, not what lasers saw alone.
         Raises ValueError, and changes nothing, if the payload is torn, of a later version, of another model or
         resolution, if the tile is absurdly far out, or if no room is left.
         """
         cells, sonar = self._unpack(payload)
+        sonar = sonar if sonars else None
         if max(abs(tile_row), abs(tile_col)) > MAX_TILE_ROW:
             raise ValueError(f"tile ({tile_row}, {tile_col}) is too far from the origin")
         slot = self._pool.slot_for(tile_row, tile_col)

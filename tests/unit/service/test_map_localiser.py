@@ -16,7 +16,9 @@ from jsonschema import Draft202012Validator
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
+from mapping.grids.tiles import TILE
 from mapping.odometry import OdometryState
 from mapping.pose_buffer import PoseBuffer
 from mapping.scan import Scan
@@ -27,10 +29,11 @@ from service.config_maps import LocaliseIn
 from service.errors import Trouble
 from service.export import image_of, save_pgm_yaml
 from service.fusion import Fusion
-from service.map_localiser import KEY, KnownMapLayer, KnownMapLocaliser, read_map, relocalise
+from service.map_localiser import KEY, KnownMapLayer, KnownMapLocaliser, read_map, relocalise, seen_by_lasers
 from service.outputs import DocumentOut, GridOut
 from service.payloads import document_message
 from service.rpc import CallRefused
+from service.store import OCCUPANCY, MapStore, occupancy_tiles
 
 SCHEMA = Path(__file__).parents[3] / "docs" / "schemas" / "localisation.v1.json"
 PERIOD_NS = 100_000_000
@@ -193,3 +196,34 @@ def test_a_map_that_is_none_ends_the_start(tmp_path: Path) -> None:
         KnownMapLocaliser(GridPatch(0.05, 0, 0, np.zeros((9, 9), dtype=np.int8)), [], submit=at_once)
     with pytest.raises(ValueError, match="map to find the robot in"):
         LocaliseIn(mode="map")
+
+
+def test_what_sonars_alone_heard_is_published_but_lasers_are_not_laid_on_it(tmp_path: Path) -> None:
+    """A laser looks through glass that a sonar has drawn: were it held to it, a robot in its place would be lost."""
+    grid = OccupancyGrid(resolution_m=0.05)
+    bearing = np.linspace(-math.pi, math.pi, 721)
+    for _ in range(5):
+        grid.insert_scan(Pose2(), bearing, np.full(len(bearing), 4.0), range_max_m=10.0)
+        grid.insert_cone(Pose2(), 2.0, cone_rad=0.3, range_max_m=3.0, range_min_m=0.2)
+    path = tmp_path / "glass.umfeld"
+    with MapStore.open(path, wall_ns=lambda: 0) as store:
+        meta = {
+            "grid": {"resolution_m": 0.05, "model": grid.model},
+            OCCUPANCY: {"resolution_m": 0.05, "tile_cells": TILE},
+        }
+        store.snapshot(
+            {"grid": list(grid.tiles()), OCCUPANCY: occupancy_tiles(grid.patch(whole_tiles=True), TILE)}, meta
+        )
+    whole = read_map(path)
+    seen = seen_by_lasers(path, whole)
+    assert (seen.row0, seen.col0, seen.cells.shape) == (whole.row0, whole.col0, whole.cells.shape)
+
+    def nearest_m(patch: GridPatch) -> float:
+        rows, cols = np.nonzero(patch.cells >= 65)
+        return float(np.hypot(rows + patch.row0 + 0.5, cols + patch.col0 + 0.5).min() * 0.05)
+
+    assert nearest_m(whole) == pytest.approx(2.0, abs=0.1)
+    assert nearest_m(seen) == pytest.approx(4.0, abs=0.1)
+    walls = whole.cells >= 65
+    far = np.hypot(*(np.indices(walls.shape) + 0.5 + np.array([[[whole.row0]], [[whole.col0]]]))) * 0.05 > 3.5
+    np.testing.assert_array_equal((seen.cells >= 65) & far, walls & far)
