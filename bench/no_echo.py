@@ -30,7 +30,7 @@ from mapping.grids.beam_model import Beams
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.narrow_gaps import without_narrow_gaps
 from sim_devices import world as worlds
-from sim_devices.floor_plan import Box, Circle, FloorPlan, Wall
+from sim_devices.floor_plan import Box, Circle, FloorPlan, Wall, load_floor_plan
 from sim_devices.world import World
 
 F64 = NDArray[np.float64]
@@ -121,6 +121,10 @@ def scenes() -> dict[str, Scene]:
         (room(-8.0, 3.0, 8.0, 12.0),), ((-14.0, 0.0), (14.0, 0.0)),
         circles=tuple(Circle(center=(x, -7.0), radius_m=0.1) for x in (-12.0, -4.0, 4.0, 12.0)),
     )  # fmt: skip
+    for name in ("flat", "office"):
+        plan = load_floor_plan(name)
+        assert plan.route is not None
+        found[f"the simulator's {name}"] = Scene(plan, plan.route.points)
     found["open field"] = with_black((), ((-5.0, 0.0), (5.0, 0.0)))
     return found
 
