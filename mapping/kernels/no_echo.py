@@ -13,7 +13,7 @@ from numba import njit
 
 TWO_PI = 2.0 * math.pi
 WIDE_RAD, WIDE_M = TWO_PI / 3.0, 2.0  # so much silence in a row is believed so far, whatever is beside it
-OPEN_RAD, OPEN_M = math.pi - 1e-6, 10.0
+OPEN_RAD, OPEN_M = math.pi - 1e-6, 12.0
 NEIGHBOUR_FACTOR = 1.5  # neighbours are no farther apart than this many times the usual spacing
 MAX_WEDGE_RAD = 0.2  # farther apart, beams are separate sensors
 SAMPLES = 31
