@@ -46,7 +46,7 @@ from service.outputs import HealthOut, OdomOut, Output, PolarOut, PoseOut, Range
 from service.payloads import RobotInfo, SensorPlace
 from service.publisher import Publisher
 from service.recording import RecordedFusion, Recorder
-from service.resident import give_back_code, give_back_heap
+from service.resident import give_back_code, give_back_heap, keep_heap_small
 from service.ros import RosSettings
 from service.rpc import CallRefused
 from service.sensors import Chain, Laser
@@ -69,7 +69,8 @@ _MAKERS_STOP_S = 4.0  # a turn of theirs may be rooms of a large map, and the co
 _BACKGROUND_STOP_S = 0.5
 _PUBLISHER_STOP_S = 2.0
 _MAVLINK_STOP_S = 1.0
-_GIVE_BACK_AT_S = (1, 6)  # the makers of maps load theirs with the first sweeps
+_GIVE_BACK_AT_S = (1, 6, 60)  # the makers of maps load theirs with the first sweeps, the first closure with the first lap
+_TRIM_EVERY_S = 60  # maps that grew and were drawn anew leave holes in the heap
 _GIL_SWITCH_S = 0.0002  # a scan takes the lock some six times; by default each may wait 5 ms for the one that computes
 
 
@@ -97,6 +98,7 @@ class Daemon:
         seconds: end by itself so long after it was ready; 0: when told.
         """
         faulthandler.enable(file=sys.__stderr__ or sys.stderr)
+        keep_heap_small()
         with _StopSignals() as asked:
             self._stop_asked = asked
             try:
@@ -117,6 +119,8 @@ class Daemon:
                     turns += 1
                     if turns in _GIVE_BACK_AT_S:
                         log.debug("%.0f MB that only starting needed given back", give_back_code() / 1e6)
+                    if turns % _TRIM_EVERY_S == 0:
+                        give_back_heap()
             finally:
                 log.info("stopping: closing ports, saving the map")
                 self._notifier.stopping("closing ports and saving the map")

@@ -73,3 +73,34 @@ def test_the_peak_is_this_programs_own() -> None:
     run = f"subprocess.run([sys.executable, '-c', {own!r}], check=True)"
     mebibytes = int(subprocess.run([sys.executable, "-c", large + run], capture_output=True, check=True).stdout)
     assert 5 < mebibytes < 200  # an interpreter, not the 400 of its parent
+
+
+_GROW = """
+import sys
+import numpy as np
+from service.resident import keep_heap_small
+def resident():
+    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) / 1024
+if sys.argv[1] == "small":
+    assert keep_heap_small()
+np.ones(3_000_000)  # a large block that was freed: others come from the heap from now on
+before = resident()
+pins = []
+for size in range(1, 60):  # an array that grows, and little things that stay between
+    grown = np.ones(size * 8192)
+    pins.append(np.ones(200))
+del grown
+print(round(resident() - before))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc's heap")
+def test_what_grew_leaves_no_holes_in_the_heap() -> None:
+    def megabytes_left(how: str) -> int:
+        ran = subprocess.run(
+            [sys.executable, "-c", _GROW, how], capture_output=True, text=True, timeout=300, check=True
+        )
+        return int(ran.stdout)
+
+    assert megabytes_left("as it is") > 10  # what is mended, where it is not
+    assert megabytes_left("small") < 3
