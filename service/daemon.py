@@ -69,7 +69,7 @@ _MAKERS_STOP_S = 4.0  # a turn of theirs may be rooms of a large map, and the co
 _BACKGROUND_STOP_S = 0.5
 _PUBLISHER_STOP_S = 2.0
 _MAVLINK_STOP_S = 1.0
-_GIVE_BACK_AT_S = (1, 6, 60)  # the makers of maps load theirs with the first sweeps, the first closure with the first lap
+_GIVE_BACK_AT_S = (1, 6, 60)  # makers of maps load theirs with the first sweeps, a closure with the first lap
 _TRIM_EVERY_S = 60  # maps that grew and were drawn anew leave holes in the heap
 _GIL_SWITCH_S = 0.0002  # a scan takes the lock some six times; by default each may wait 5 ms for the one that computes
 
