@@ -2,7 +2,8 @@
 
 Counting cell by cell makes walls as thick as poses scatter. Here the beams of sweeps that robots take every STEP_M or
 STEP_RAD of the way are counted together (mapping.grids.live_walls), and the grid is told which cells are walls. The
-grid itself stays as counted, and so do clearance, guards and sector maps (OccupancyGrid.show_walls).
+grid itself stays as counted (OccupancyGrid.show_walls); clearance keeps clear of what was counted, too, and sector maps
+know nothing of grids.
 """
 
 from __future__ import annotations
