@@ -357,7 +357,8 @@ def is_leaf(squared: Any, row: Any, col: Any, lines: Any, least: float, most: fl
     lines: (D, 4) of door_lines: one end is the jamb, the other on the leaf. The hinge is where, from the tip through
     the latter, the way back is as long as that on to the jamb: so long, `least` to `most`, is the leaf, and so wide the
     opening. It stands open by 40 to 160 degrees, is free on both sides at `beside`, but for its ends, and behind its
-    hinge the wall goes on. All lengths in cells.
+    hinge the wall goes on. At `beside` around its tip there is nothing but the leaf: else the jamb that a leaf hangs at
+    would be a tip for an opening behind it. All lengths in cells.
     """
     for k in range(lines.shape[0]):
         for e in range(2):
@@ -374,12 +375,27 @@ def is_leaf(squared: Any, row: Any, col: Any, lines: Any, least: float, most: fl
             if not (least <= length <= most and 0.4 * length <= seen <= 1.3 * length):
                 continue
             open_cos = (length - ahead) / length
-            if -0.94 <= open_cos <= 0.77 and _is_thin_wall(squared, row, col, down, right, length, beside):
+            if not (-0.94 <= open_cos <= 0.77 and _is_free_end(squared, row, col, down, right, beside)):
+                continue
+            if _is_thin_wall(squared, row, col, down, right, length, beside):
                 behind_down = row + down * length + (down * length - jamb_down) * 0.75 * beside / length
                 behind_right = col + right * length + (right * length - jamb_right) * 0.75 * beside / length
                 if obstacle_near(squared, behind_down, behind_right, 1):
                     return True
     return False
+
+
+@njit(cache=True, nogil=True)
+def _is_free_end(squared: Any, row: Any, col: Any, down: float, right: float, beside: float) -> bool:
+    """Whether nothing is `beside` from (row, col) but within 60 degrees of that direction, in which its wall goes."""
+    rows, cols = squared.shape
+    for step in range(4, 21):
+        c, s = math.cos(math.radians(15.0 * step)), math.sin(math.radians(15.0 * step))
+        r = math.floor(row + beside * (c * down - s * right) + 0.5)
+        k = math.floor(col + beside * (s * down + c * right) + 0.5)
+        if not (0 <= r < rows and 0 <= k < cols) or squared[r, k] == 0:
+            return False
+    return True
 
 
 @njit(cache=True, nogil=True)

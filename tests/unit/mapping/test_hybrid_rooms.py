@@ -318,6 +318,32 @@ def test_a_wall_as_long_as_a_leaf_parts_a_room_where_no_door_is() -> None:
     assert len(find_rooms(living_room(opening=False), CELL_M).rooms) == 3
 
 
+def study(open_deg: float) -> Bools:
+    """4 x 3.4 m below a corridor, a shelf of 0.4 x 2.2 m at its left wall; the leaf of its door, 0.9 m, hangs at the
+    jamb on the left and leaves 0.7 m between its tip and the shelf."""
+    free = np.zeros((130, 150), dtype=np.bool_)
+    free[20:48, 10:140] = True
+    free[50:118, 40:120] = True
+    free[48:50, 66:84] = True
+    free[68:112, 40:48] = False
+    turn = math.radians(open_deg)
+    for length in np.arange(0.0, 18.5, 0.25):
+        row, col = 49.5 + length * math.sin(turn), 65.5 + length * math.cos(turn)
+        free[round(row), round(col)] = free[round(row), round(col) + 1] = False
+    return free
+
+
+@pytest.mark.parametrize("turned_by", [0.0, 90.0, 25.0, -40.0])
+@pytest.mark.parametrize("open_deg", [90.0, 95.0, 100.0, 105.0])
+def test_the_jamb_that_a_leaf_hangs_at_is_not_its_tip(turned_by: float, open_deg: float) -> None:
+    """A bug: an opening between a leaf and furniture behind it made a tip of the jamb, and the door was none."""
+    free = ndimage.rotate(study(open_deg).astype(np.float64), turned_by, order=1) > 0.5
+    found = find_rooms(free, CELL_M)
+    assert len(found.rooms) == 2
+    assert len(found.doors) == 1
+    assert found.doors[0].width_m == pytest.approx(0.95, abs=0.2)
+
+
 def literal_cracks(free: Bools, wide: int, deep: int, thick: int) -> Bools:
     """Cells of cracks along columns, looked for cell by cell."""
     rows, cols = free.shape
