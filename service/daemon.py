@@ -38,7 +38,7 @@ from service.background import Background
 from service.clock import Clock, SystemClock
 from service.config import Config, Loaded
 from service.errors import Trouble
-from service.live_map import SLAM, LiveMap, restore
+from service.live_map import GRID, SLAM, LiveMap, restore, told_of
 from service.locks import Claims
 from service.maker_calls import maker_calls
 from service.map_makers import MapMakers, SweepTap
@@ -57,6 +57,7 @@ from service.worker import Worker
 from service.zenoh_session import NetworkSettings, TlsFiles
 
 if TYPE_CHECKING:
+    from mapping.grids.occupancy import OccupancyGrid
     from service.layers import BuildingLayer
     from service.mavlink_out import MavlinkOut
 
@@ -154,14 +155,8 @@ class Daemon:
         store = self._open_store()
         maps = assemble.maps(config, self._sensors)
         start_pose = None if store is None or maps.building is None else restore(maps.building.grid, store)
-        if start_pose is not None and store is not None and store.layers().get("grid"):
-            log.warning(
-                "the map goes on where it was left, with the robot at x %.2f m y %.2f m yaw %.0f deg: %s",
-                start_pose.x_m, start_pose.y_m, math.degrees(start_pose.yaw_rad),
-                "it is looked for there, then everywhere, before anything is drawn"
-                if config.slam.enabled and store.layers().get(SLAM)
-                else "if it was moved since, begin a new map (`umfeld map new`) or load one",
-            )  # fmt: skip
+        if start_pose is not None and store is not None and maps.building is not None:
+            self._tell_where_it_goes_on(store, maps.building.grid, start_pose)
         self._publisher = self._make_publisher()
         self._parts.callback(self._close_publisher)
         self._publisher.add_tap(self._recorder.message)
@@ -266,6 +261,18 @@ class Daemon:
         store.add_provenance(Provenance(self._wall_ns(), _version(), digest, devices))
         return store
 
+    def _tell_where_it_goes_on(self, store: MapStore, grid: OccupancyGrid, pose: Pose2) -> None:
+        if not store.layers().get(GRID):
+            log.info("a new map begins: %s", store.path)
+            return
+        log.warning(
+            "the map goes on where it was left (%s), with the robot at x %.2f m y %.2f m yaw %.0f deg: %s",
+            told_of(store, grid, self._wall_ns()), pose.x_m, pose.y_m, math.degrees(pose.yaw_rad),
+            "it is looked for there, then everywhere, before anything is drawn"
+            if self._config.slam.enabled and store.layers().get(SLAM)
+            else "if it was moved since, begin a new map (`umfeld map new`) or load one",
+        )  # fmt: skip
+
     def _make_publisher(self) -> Publisher:
         config = self._config
         ros = RosSettings(
@@ -292,7 +299,7 @@ class Daemon:
                 **self._makers.counters(),
                 **({} if self._mavlink is None else self._mavlink.counters()),
             },
-            troubles=[*self._fusion.troubles(now_ns), *self._map_troubles(), *self._other_troubles()],
+            troubles=[*self._fusion.troubles(now_ns), *self._map_troubles(), *self._other_troubles(now_ns)],
         )
         kinds = {name: sensor.kind for name, sensor in self._sensors.items()}
         wires = [reader.health() for reader in self._readers]
@@ -347,8 +354,9 @@ class Daemon:
         self._fusion.drain()
         return {"map_sha256": recording.digest_of(building.grid)}
 
-    def _other_troubles(self) -> list[str]:
-        troubles = (self._recorder.trouble(), None if self._mavlink is None else self._mavlink.trouble())
+    def _other_troubles(self, now_ns: int) -> list[str]:
+        mavlink = None if self._mavlink is None else self._mavlink.trouble()
+        troubles = (self._publisher.trouble(now_ns), self._recorder.trouble(), mavlink)
         return [trouble for trouble in troubles if trouble is not None]
 
     def _offer(self, output: Output) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import hashlib
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,6 +16,7 @@ from pathlib import Path
 from service.errors import Trouble
 
 _BLOCK = 1 << 20
+_PART = ".part"
 
 
 class FileTrouble(Trouble):
@@ -48,15 +51,16 @@ def write_whole(path: Path, data: bytes) -> Receipt:
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path in the same folder; what is written there takes the place of path at the end, synced.
 
-    On an error nothing is left behind and path is as it was. OSErrors become FileTrouble.
+    On an error nothing is left behind and path is as it was. OSErrors become FileTrouble. It is locked meanwhile: see
+    remove_abandoned.
     """
     try:
-        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        os.close(descriptor)
+        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_PART, dir=path.parent)
     except OSError as error:
         raise _cannot_write(path, error) from error
     temporary = Path(name)
     try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield temporary
         temporary.chmod(0o666 & ~_umask())
         sync(temporary)
@@ -66,6 +70,22 @@ def replacing(path: Path) -> Iterator[Path]:
         raise _cannot_write(path, error) from error
     finally:
         temporary.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def remove_abandoned(folder: Path, name_part: str) -> int:
+    """Remove temporary files of replacing() whose process was killed, and what SQLite put beside them; how many bytes.
+
+    name_part: in the name of the file that was to be replaced. What another process still writes is locked, and stays.
+    """
+    removed = 0
+    for temporary in folder.glob(f".*{name_part}*{_PART}"):
+        with suppress(OSError), temporary.open("rb") as file:  # gone meanwhile, another's, or locked
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            for each in (temporary, *folder.glob(f"{glob.escape(temporary.name)}[-.]*")):
+                removed += each.stat().st_size
+                each.unlink()
+    return removed
 
 
 def sync(path: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -264,6 +265,27 @@ def restore(grid: OccupancyGrid, store: MapStore) -> Pose2:
         log.error("%s: %d tiles were left out; older ones are in %s.1", store.path, refused, store.path.name)
     pose = store.get_meta("pose")
     return IDENTITY if not isinstance(pose, dict) else Pose2(pose["x_m"], pose["y_m"], pose["yaw_rad"])
+
+
+def told_of(store: MapStore, grid: OccupancyGrid, wall_ns: int) -> str:
+    """How much of a building was restored from a store, and how old that is, in words."""
+    square_m = int((grid.patch().cells >= 0).sum()) * grid.resolution_m**2
+    saved_ns = store.get_meta("saved_ns")
+    if not isinstance(saved_ns, int):
+        return f"{store.path}, {square_m:.0f} m² known"
+    at = datetime.fromtimestamp(saved_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    age_s = round((wall_ns - saved_ns) / 1e9)
+    if age_s < 0:
+        return f"{store.path}, {square_m:.0f} m² known, saved at {at}, by a clock that was ahead of today's"
+    return f"{store.path}, {square_m:.0f} m² known, saved at {at}, {span_in_words(age_s)} ago"
+
+
+def span_in_words(seconds: float) -> str:
+    """A time in the unit that suits it: 12 s, 3 min, 5 h, 2 days."""
+    for unit, name, most in ((1, "s", 120), (60, "min", 120 * 60), (3600, "h", 48 * 3600)):
+        if seconds < most:
+            return f"{seconds / unit:.0f} {name}"
+    return f"{seconds / 86400:.0f} days"
 
 
 def check_fits(grid: OccupancyGrid, store: MapStore) -> None:

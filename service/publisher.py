@@ -24,6 +24,7 @@ from typing import Any
 
 from service import export, topics, zenoh_session
 from service.clock import Clock
+from service.namesakes import Namesakes
 from service.outputs import (
     CloudOut,
     DocumentOut,
@@ -149,6 +150,7 @@ class Publisher:
         self._ros: RosMirror | None = None
         self._session: Any = None
         self._token: Any = None
+        self._namesakes: Namesakes | None = None
         self._outboxes = {lane: Outbox() for lane in Lane}
         self._publishers: dict[str, tuple[Any, Readers | None]] = {}
         self._last: dict[str, _Kept] = {}
@@ -180,8 +182,13 @@ class Publisher:
             self.announce()
 
     def announce(self) -> None:
-        """Put the liveliness token up."""
+        """Put the liveliness token up, and look for other daemons of this robot's id."""
         self._token = self._session.liveliness().declare_token(f"{self.base}/{topics.ALIVE}")
+        self._namesakes = Namesakes(self._session, self.base)
+
+    def trouble(self, now_ns: int) -> str | None:
+        """What is wrong with the network, in words; for one thread."""
+        return None if self._namesakes is None else self._namesakes.trouble(now_ns)
 
     def _spawn(self, name: str, target: Callable[..., None], *arguments: object) -> None:
         thread = threading.Thread(target=target, args=arguments, name=name, daemon=True)

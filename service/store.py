@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.grids.patch import GridPatch
-from service.files import FileTrouble, Receipt, receipt_of, replacing, sync
+from service.files import FileTrouble, Receipt, receipt_of, remove_abandoned, replacing, sync
 
 _LOG = logging.getLogger(__name__)
 
@@ -116,6 +116,8 @@ class MapStore:
             where = f" ({error.filename})" if error.filename not in (None, str(path)) else ""
             raise StoreTrouble(f"{path}: {error.strerror}{where}; allow writing there or set [store] path") from error
         try:
+            if abandoned := remove_abandoned(path.parent, SUFFIX):
+                _LOG.info("%s: %.1f MB that a killed process had begun to save removed", path.parent, abandoned / 1e6)
             restored = _repair(path)
             connection = _connect(path, read_only=False)
             _migrate(connection, path)
@@ -246,8 +248,7 @@ class MapStore:
             raise StoreTrouble(f"{path}: is the open map itself; choose another name")
         with self._mutex:
             try:
-                with replacing(path) as temporary:
-                    temporary.unlink()  # VACUUM INTO wants to make the file itself
+                with replacing(path) as temporary:  # empty, as VACUUM INTO wants it
                     self._db.execute("VACUUM INTO ?", (str(temporary),))
             except sqlite3.Error as error:
                 raise StoreNotWritten(_why_not_written(path, error)) from error
@@ -647,7 +648,6 @@ def write_occupancy_map(
     """
     properties = {"resolution_m": patch.resolution_m, "tile_cells": tile_cells}
     with replacing(path) as temporary:
-        temporary.unlink()
         try:
             with MapStore.open(temporary, wall_ns=time.time_ns) as store:
                 store.snapshot(

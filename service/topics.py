@@ -382,6 +382,9 @@ INFO = Topic(
 ALIVE = "alive"
 """The liveliness token below the base: there while the daemon is, gone at once when it ends."""
 
+DAEMON = "@daemon"
+"""The chunk before each daemon's own liveliness token: its Zenoh id, host and process."""
+
 RPC = "@rpc"
 """The chunk before the names of calls. `*` and `**` never match it, so a wildcard get() calls nothing."""
 
@@ -453,6 +456,10 @@ def markdown_table() -> str:
             f" | {topic.meaning} |"
         )
     lines.append(f"| `{ALIVE}` | | | | | liveliness token | There while the daemon is; gone at once when it ends. |")
+    lines.append(
+        f"| `{DAEMON}/<zenoh id>/<host>/<process>` | | | | | liveliness token"
+        " | Of each daemon, so that two of one id are noticed. `*` and `**` never match it. |"
+    )
     lines.append(
         f"| `{RPC}/<name>` | JSON in, JSON out | `{JSON_REPLY}` | | | no"
         " | Calls, by get() with a payload. `*` and `**` never match them. |"

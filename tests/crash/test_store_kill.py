@@ -14,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 
+from service.files import replacing
 from service.store import MapStore, check_file
 
 KILLS = int(os.environ.get("UMFELD_CRASHES", "25"))
@@ -63,6 +64,47 @@ def test_kill_at_any_time(tmp_path: Path) -> None:
     for generation in tmp_path.glob("m.umfeld.[12]"):
         assert check_file(generation) is None
     assert last > KILLS
+
+
+SAVER = """
+import sys
+from pathlib import Path
+from service.store import MapStore
+with MapStore.open(Path(sys.argv[1]), wall_ns=lambda: 0) as store:
+    print("saving", flush=True)
+    while True:
+        store.save_as(Path(sys.argv[1]).with_name("kitchen.umfeld"))
+"""
+
+
+def test_what_a_killed_save_left_behind_goes_with_the_next_start(tmp_path: Path) -> None:
+    """Each one is as large as the map, and nothing else would ever remove it."""
+    path = tmp_path / "m.umfeld"
+    with MapStore.open(path, wall_ns=lambda: 0) as store:
+        store.snapshot({"a": [(row, 0, os.urandom(100_000)) for row in range(TILES)]}, {})
+    dice = random.Random(5)
+    left = 0
+    for _ in range(KILLS):
+        saver = subprocess.Popen([sys.executable, "-c", SAVER, str(path)], stdout=subprocess.PIPE)
+        assert saver.stdout is not None
+        assert saver.stdout.readline()
+        time.sleep(dice.uniform(0, 0.03))  # the very point of the test is an arbitrary instant
+        saver.kill()
+        saver.communicate()
+        left += bool([*tmp_path.glob(".*.part*")])
+        MapStore.open(path, wall_ns=lambda: 0).close()
+        assert not [*tmp_path.glob(".*.part*")]
+    assert left > KILLS / 5, "else nothing was tried"
+    assert check_file(tmp_path / "kitchen.umfeld") is None
+
+
+def test_what_another_process_still_saves_stays(tmp_path: Path) -> None:
+    elsewhere = tmp_path / "other[1].umfeld"
+    with replacing(elsewhere) as temporary:
+        temporary.write_bytes(b"begun")
+        MapStore.open(tmp_path / "m.umfeld", wall_ns=lambda: 0).close()
+        assert temporary.read_bytes() == b"begun"
+    assert elsewhere.read_bytes() == b"begun"
 
 
 def test_torn_writes_of_the_log(tmp_path: Path) -> None:

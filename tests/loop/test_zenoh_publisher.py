@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import struct
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service import cdr
 from service.clock import SystemClock
+from service.namesakes import BELIEVED_AFTER_NS
 from service.outputs import GridOut, GridUpdateOut, HealthOut, OdomOut, Output, PoseOut, ScanOut
 from service.payloads import RobotInfo
 from service.publisher import Publisher
@@ -290,6 +292,29 @@ def test_alive_while_it_lives(endpoint: str) -> None:
         publisher.close()
         with pytest.raises(NoDaemon):
             client.only_base()
+
+
+def test_another_daemon_of_this_name_is_told_with_its_repair(
+    publisher: Publisher, endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two robots with one id behind linked routers: whoever reads gets both, mixed, and nothing said so."""
+    assert publisher.trouble(0) is None
+    other_robot = Publisher("robots/r2", NetworkSettings((free_endpoint(),), (endpoint,)), clock=SystemClock())
+    twin = Publisher(BASE, NetworkSettings((free_endpoint(),), (endpoint,)), clock=SystemClock())
+    other_robot.start()
+    twin.start()
+    stamps = count(0, SECOND)  # a second passes with each question
+
+    trouble = wait_until(lambda: publisher.trouble(next(stamps)))
+    assert re.fullmatch(r"another daemon calls itself r1 too \(process \d+ on \S+\) .*\[robot\] id", trouble)
+    assert next(stamps) > BELIEVED_AFTER_NS, "our own earlier self may linger behind another router for a lease"
+    assert publisher.trouble(next(stamps)) == trouble
+    assert wait_until(lambda: twin.trouble(next(stamps)))
+    assert other_robot.trouble(next(stamps)) is None
+    assert [record.message for record in caplog.records] == [trouble] * 2, "each tells it once"
+    assert twin.close(GIVE_UP_S)
+    wait_until(lambda: publisher.trouble(next(stamps)) is None)
+    assert other_robot.close(GIVE_UP_S)
 
 
 def test_a_port_in_use_names_the_repair(publisher: Publisher, endpoint: str) -> None:

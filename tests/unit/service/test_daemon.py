@@ -24,7 +24,7 @@ from service.daemon import Daemon, network_settings
 from service.errors import Trouble
 from service.fusion import Fusion, Parts
 from service.layers import BuildingLayer
-from service.live_map import GRID, LiveMap, restore
+from service.live_map import GRID, LiveMap, restore, told_of
 from service.locks import Claims
 from service.outputs import GridOut, GridUpdateOut, HealthOut, Output, ScanOut
 from service.rpc import CallRefused
@@ -323,6 +323,25 @@ def test_a_map_comes_back_as_it_was_left_and_the_robot_where_it_stood(store: Map
     assert restore(again.grid, store) == Pose2(30.0, -5.0, 1.0)
     assert list(again.grid.tiles()) == list(layer.grid.tiles())
     np.testing.assert_array_equal(occupancy_patch(store).cells, layer.grid.patch().cells)
+
+
+@pytest.mark.parametrize(
+    ("later_s", "told"),
+    [
+        (12, "saved at 1970-01-01 00:00:00 UTC, 12 s ago"),
+        (600, "10 min ago"),
+        (7 * 3600, "7 h ago"),
+        (9 * 86400, "9 days ago"),
+        (-3600, "by a clock that was ahead of today's"),
+    ],
+)
+def test_the_start_says_how_much_was_restored_and_how_old_it_is(store: MapStore, later_s: int, told: str) -> None:
+    layer = building()
+    draw(layer, 0.0)
+    assert live(layer, store).snapshot()
+    told_now = told_of(store, layer.grid, 1 + later_s * SECOND)
+    assert told_now.startswith(f"{store.path}, 12 m² known, ")
+    assert told in told_now
 
 
 def test_a_snapshot_writes_only_what_changed(store: MapStore) -> None:
