@@ -39,6 +39,7 @@ from service.clock import Clock, SystemClock
 from service.config import Config, Loaded
 from service.errors import Trouble
 from service.live_map import GRID, SLAM, LiveMap, restore, told_of
+from service.loaded_kernels import keep_loaded_kernels_packed
 from service.locks import Claims
 from service.maker_calls import maker_calls
 from service.map_makers import MapMakers, SweepTap
@@ -100,6 +101,7 @@ class Daemon:
         """
         faulthandler.enable(file=sys.__stderr__ or sys.stderr)
         keep_heap_small()
+        keep_loaded_kernels_packed()
         with _StopSignals() as asked:
             self._stop_asked = asked
             try:

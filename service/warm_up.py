@@ -1,7 +1,7 @@
 """Kernels ready before the first reading: loaded from numba's cache, or else compiled by processes beside this one.
 
-After each update compiling takes a minute of processor time. Two processes share it; this one stays as small as with
-a warm cache (a compiler keeps some 250 MB) and can be told to stop meanwhile.
+After each update compiling takes a minute of processor time. Two processes share it; this one compiles nothing, stays
+as small as with a warm cache (a compiler keeps some 250 MB) and can be told to stop meanwhile.
 """
 
 from __future__ import annotations
@@ -74,13 +74,18 @@ def warm_up_for_logs() -> None:
 
 
 def _warm(config: Config, steps: dict[str, Step], stop_asked: Callable[[], bool], meanwhile: Meanwhile | None) -> None:
-    asked_others = False
-    for count, step in enumerate(list(steps.values()), start=1):
-        with _compilations() as compiled:
+    is_cold = False
+    for count, step in enumerate(steps.values()):
+        if is_cold:
             step()
-        if compiled and not asked_others:  # the cache is cold
-            asked_others = True
+            continue
+        try:
+            with _nothing_compiled():
+                step()
+        except _CacheIsCold:
+            is_cold = True
             _compile_beside(config, list(steps)[count:], stop_asked, meanwhile)
+            step()  # what others could not put into the cache is compiled here after all
 
 
 def _steps(config: Config) -> dict[str, Step]:
@@ -137,22 +142,45 @@ def _steps(config: Config) -> dict[str, Step]:
 # --- compiling beside this process ------------------------------------------------------------------------------------
 
 
+class _CacheIsCold(BaseException):
+    """A kernel would have to be compiled. No Exception: no part of ours may take it for a failure of its own."""
+
+
+@contextmanager
+def _nothing_compiled() -> Iterator[None]:
+    """The first kernel that is not in the cache ends the block with _CacheIsCold, before anything is compiled: what a
+    compiler takes it keeps, some 50 MB for the smallest kernel."""
+
+    def refuse(_kernel: str) -> None:
+        raise _CacheIsCold
+
+    with _on_compiling(refuse):
+        yield
+
+
 @contextmanager
 def _compilations() -> Iterator[list[str]]:
-    """Names of the kernels that are compiled, not loaded, while the block runs."""
+    """Names of the kernels that are to be compiled, not loaded, while the block runs."""
+    names: list[str] = []
+    with _on_compiling(names.append):
+        yield names
+
+
+@contextmanager
+def _on_compiling(tell: Callable[[str], None]) -> Iterator[None]:
+    """Tell each kernel that is about to be compiled while the block runs."""
 
     class Listener(event.Listener):
         def on_start(self, event: Any) -> None:
-            names.append(str(event.data["dispatcher"]))
+            tell(str(event.data["dispatcher"]))
 
         def on_end(self, event: Any) -> None:
             pass
 
-    names: list[str] = []
     listener = Listener()
     event.register("numba:compile", listener)  # type: ignore[no-untyped-call]
     try:
-        yield names
+        yield
     finally:
         event.unregister("numba:compile", listener)  # type: ignore[no-untyped-call]
 
