@@ -131,6 +131,10 @@ def _steps(config: Config) -> dict[str, Step]:
         from mapping.localise.warm_up import warm_up as warm_up_slam
 
         steps["slam"] = warm_up_slam
+    if "calibration" in names:
+        from mapping.localise.warm_up import warm_up_calibration
+
+        steps["calibration"] = warm_up_calibration
     if has_slam:
         from mapping.grids.warm_up import warm_up as warm_up_grids
 

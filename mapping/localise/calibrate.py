@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import wrap_angles
-from mapping.localise.pose_graph import composed_poses, relative_poses
+from mapping.kernels import calibrate as kernels
+from mapping.localise.pose_graph import relative_poses
 from mapping.localise.relative_motions import RelativeMotions
 
 F64 = NDArray[np.float64]
@@ -164,23 +165,10 @@ def dead_reckoned(ticks: WheelTicks, model: F64, at_s: F64) -> F64:
 
     Between two samples both wheels turn evenly: arcs, exact. Beyond the ends the robot stands.
     """
-    left, right = np.diff(ticks.left) * model[LEFT], np.diff(ticks.right) * model[RIGHT]
-    corners = np.zeros((len(ticks.stamp_s), 3))
-    way, turn = 0.5 * (left + right), (right - left) / model[TRACK]
-    corners[1:, 2] = np.cumsum(turn)
-    corners[1:, :2] = np.cumsum(_chords(way, turn, corners[:-1, 2]), axis=0)
-    k = np.clip(np.searchsorted(ticks.stamp_s, at_s, side="right") - 1, 0, len(ticks.stamp_s) - 2)
-    share = np.clip((at_s - ticks.stamp_s[k]) / (ticks.stamp_s[k + 1] - ticks.stamp_s[k]), 0.0, 1.0)
-    pose = corners[k].copy()
-    pose[:, :2] += _chords(share * way[k], share * turn[k], pose[:, 2])
-    pose[:, 2] += share * turn[k]
-    return pose
-
-
-def _chords(way: F64, turn: F64, yaw: F64) -> F64:
-    chord = way * np.sinc(turn / (2.0 * np.pi))  # arc * sin(t / 2) / (t / 2)
-    heading = yaw + 0.5 * turn
-    return np.stack((chord * np.cos(heading), chord * np.sin(heading)), axis=-1)
+    poses = np.empty((len(at_s), 3))
+    stamp_s, left, right, model, at_s = _contiguous(ticks.stamp_s, ticks.left, ticks.right, model, at_s)
+    kernels.poses_at(stamp_s, left, right, model, at_s, poses)
+    return poses
 
 
 def base_motions(ticks: WheelTicks, motions: RelativeMotions, model: F64) -> F64:
@@ -195,6 +183,8 @@ class _Problem:
 
     def __init__(self, ticks: WheelTicks, motions: RelativeMotions, start: RobotModel) -> None:
         self._ticks, self._motions, self._start = ticks, motions, start.row()
+        self._rows = _contiguous(ticks.stamp_s, ticks.left, ticks.right)
+        self._measured = _contiguous(motions.start_s, motions.end_s, motions.motion)
         self._whiten = np.linalg.inv(np.linalg.cholesky(motions.covariance))
 
     def model(self, offsets: F64) -> F64:
@@ -207,37 +197,41 @@ class _Problem:
         offsets[RELATIVE] = np.log(np.abs(model.row()[RELATIVE] / self._start[RELATIVE]))
         return offsets
 
+    def whitened(self, *offsets: F64) -> F64:
+        """(P, K, 3) measured minus expected motions of the laser for each of P offsets, in their own deviations."""
+        return self._off(np.array([self.model(each) for each in offsets]), self._whiten)
+
     def plain(self, offsets: F64) -> F64:
-        """(K, 3) measured minus expected motions of the laser, metres and radians."""
-        model = self.model(offsets)
-        base = base_motions(self._ticks, self._motions, model)
-        mount = model[X : YAW + 1]
-        expected = relative_poses(np.broadcast_to(mount, base.shape), composed_poses(base, _rows(mount, len(base))))
-        off = self._motions.motion - expected
-        off[:, 2] = wrap_angles(off[:, 2])
+        """(K, 3) the same in metres and radians."""
+        as_measured = np.broadcast_to(np.eye(3), self._whiten.shape).copy()
+        off: F64 = self._off(self.model(offsets)[None, :], as_measured)[0]
         return off
 
-    def whitened(self, offsets: F64) -> F64:
-        return np.asarray(np.einsum("kij,kj->ki", self._whiten, self.plain(offsets)))
+    def _off(self, models: F64, whiten: F64) -> F64:
+        off = np.empty((len(models), len(self._motions), 3))
+        (stamp_s, left, right), (start_s, end_s, motion) = self._rows, self._measured
+        kernels.misfits(stamp_s, left, right, models, start_s, end_s, motion, whiten, off)
+        return off
 
-    def jacobian(self, offsets: F64) -> F64:
-        """(K, 3, 7) of the whitened residuals."""
-        columns = []
-        for k, nudge in enumerate(NUDGE):
-            step = np.zeros(7)
-            step[k] = nudge
-            columns.append((self.whitened(offsets + step) - self.whitened(offsets - step)) / (2.0 * nudge))
-        return np.stack(columns, axis=-1)
+    def jacobian(self, offsets: F64) -> tuple[F64, F64]:
+        """The whitened residuals (K, 3), and (K, 3, 7) how they change with each offset."""
+        nudged = [offsets + sign * nudge * unit for nudge, unit in zip(NUDGE, np.eye(7)) for sign in (1.0, -1.0)]
+        residual, *ahead_and_behind = self.whitened(offsets, *nudged)
+        columns = [
+            (ahead - behind) / (2.0 * nudge)
+            for nudge, ahead, behind in zip(NUDGE, ahead_and_behind[::2], ahead_and_behind[1::2])
+        ]
+        return residual, np.stack(columns, axis=-1)
 
     def spread(self, offsets: F64) -> float:
         """Median squared distance, which outliers do not move."""
-        return float(np.median(np.sum(self.whitened(offsets) ** 2, axis=1)))
+        return float(np.median(np.sum(self.whitened(offsets)[0] ** 2, axis=1)))
 
     def solved(self, offsets: F64) -> Calibration:
         information = np.diag(PRIOR**-2.0)
         for number in range(MOST_STEPS):
             gate = max(GATE, WIDEST_GATE * NARROWING**number)
-            residual, J = self.whitened(offsets), self.jacobian(offsets)
+            residual, J = self.jacobian(offsets)
             kept, scale2 = _kept(residual, gate)
             rows = J[kept].reshape(-1, 7) / math.sqrt(scale2)
             normal = rows.T @ rows + information
@@ -249,7 +243,7 @@ class _Problem:
         return self._told(offsets)
 
     def _told(self, offsets: F64) -> Calibration:
-        residual, J = self.whitened(offsets), self.jacobian(offsets)
+        residual, J = self.jacobian(offsets)
         kept, scale2 = _kept(residual)
         covariance = _covariance(J[kept], residual[kept], scale2)
         deviation = np.sqrt(np.diag(covariance))
@@ -381,8 +375,9 @@ def _only(motions: RelativeMotions, chosen: Bools) -> RelativeMotions:
     return RelativeMotions(m.start_s[chosen], m.end_s[chosen], m.motion[chosen], m.covariance[chosen], m.rejected)
 
 
-def _rows(row: F64, count: int) -> F64:
-    return np.repeat(row[None, :], count, axis=0)
+def _contiguous(*arrays: F64) -> tuple[F64, ...]:
+    """As compiled loops take them."""
+    return tuple(np.array(array, dtype=np.float64, order="C") for array in arrays)
 
 
 def _nothing(start: RobotModel, motions: int) -> Calibration:

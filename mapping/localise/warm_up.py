@@ -8,10 +8,12 @@ import numpy as np
 
 from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
+from mapping.localise.calibrate import LEAST_MOTIONS, RobotModel, WheelTicks, calibrate
 from mapping.localise.in_map import MapLocaliser
 from mapping.localise.kept_sweeps import kept_sweep
 from mapping.localise.known_map import known_map, points_of
 from mapping.localise.pose_graph import Edges, optimise
+from mapping.localise.relative_motions import RelativeMotions
 from mapping.localise.scan_match import agreement, match_view
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.slam import Slam
@@ -72,3 +74,13 @@ def warm_up_in_map() -> None:
         work = localiser.take_work()
         if work is not None:
             work.run()
+
+
+def warm_up_calibration() -> None:
+    """Fit a drive that is thrown away: straight on, and a bend every third second."""
+    seconds = np.arange(LEAST_MOTIONS + 2.0)
+    turn = 0.1 * (seconds[:-2] % 3.0 == 0.0)
+    ticks = WheelTicks(seconds, 0.2 * seconds, 0.2 * seconds + 0.04 * np.ceil(seconds / 3.0))
+    motion = np.stack((np.full(len(turn), 0.2), 0.1 * turn, turn), axis=-1)
+    certainty = np.repeat(1e-6 * np.eye(3)[None, :], len(turn), axis=0)
+    calibrate(ticks, RelativeMotions(seconds[:-2], seconds[1:-1], motion, certainty), RobotModel(1.0, 1.0, 0.4))
