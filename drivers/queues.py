@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from typing import Generic, TypeVar
 
 from drivers.readings import DeviceEvent
@@ -75,6 +75,25 @@ class BoundedQueue(Generic[ItemT]):
             self._droppable.clear()
             self._urgent = False
             return items
+
+    def take(self, choose: Callable[[Sequence[tuple[str, ItemT]]], Collection[int]]) -> list[tuple[str, ItemT]]:
+        """What is chosen of all that waits, oldest first, without waiting; the rest keeps its order.
+
+        choose: gets the items, oldest first, and tells places among them; it must be quick and put nothing.
+        """
+        if not self._items:
+            return []
+        with self._lock:
+            places = set(choose(tuple(self._items)))
+            if not places:
+                return []
+            taken = [entry for place, entry in enumerate(self._items) if place in places]
+            self._items = deque(entry for place, entry in enumerate(self._items) if place not in places)
+            for source, item in taken:
+                if not self._keep(item):
+                    self._droppable[source] -= 1
+            self._urgent = self._urgent and bool(self._items)
+            return taken
 
     def __len__(self) -> int:
         return len(self._items)

@@ -1,18 +1,20 @@
 """The fusion thread: takes what the wires say, hands it to fusion, publishes what comes out, beats the watchdog.
 
-Everything that touches the maps happens here; other threads ask (`ask`) and wait.
+Everything that touches the maps happens here; other threads ask (`ask`) and wait. A sweep goes before sonar rounds,
+questions, the grids and reports that wait, whenever it comes: it is what a robot brakes by, and each of them takes a
+millisecond or more.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TypeVar
 
 from drivers.queues import BoundedQueue
-from drivers.readings import DeviceEvent, PoseReading, Reading, ScanReading, WheelReading
+from drivers.readings import ChainReading, DeviceEvent, PoseReading, Reading, ScanReading, WheelReading
 from service.errors import Trouble
 from service.fusion import POSE_PERIOD_NS, SECOND, TICK_PERIOD_NS, Fusion
 from service.outputs import HealthOut, Output
@@ -147,27 +149,44 @@ class Worker:
         """One turn of the loop; tests call it without the thread."""
         items = self._queue.get_all(timeout_s)
         began_ns = self._now_ns()
-        for source, item in items:
-            if isinstance(item, _Asked):
-                item.run()
-                continue
-            self._take(source, item)
-            if isinstance(item, ScanReading):
-                self._sweep_waits = True
-            if isinstance(item, DeviceEvent):
-                self._next_health_ns = min(self._next_health_ns, self._health_told_ns + _HEALTH_GAP_NS)
-        now_ns = self._now_ns()
+        first = goes_first(items)
+        is_news = any(isinstance(item, DeviceEvent) for _, item in items)
+        for place in first:
+            self._handle(*items[place])
+        for place in (place for place in range(len(items)) if place not in first):
+            if not is_news:
+                self._let_sweeps_ahead()
+            self._handle(*items[place])
         if items:
             self._offered()  # before the slow part
-            self._guard("settle", partial(self._settle, now_ns))
-        if now_ns >= self._next_tick_ns:
+            self._let_sweeps_ahead()
+            self._guard("settle", partial(self._settle, self._now_ns()))
+        if self._now_ns() >= self._next_tick_ns:
+            self._let_sweeps_ahead()
+            now_ns = self._now_ns()
             self._next_tick_ns = now_ns + TICK_PERIOD_NS
             self._guard("tick", partial(self._fusion.tick, now_ns))
-        if now_ns >= self._next_health_ns:
-            self._tell_health(now_ns)
+        if self._now_ns() >= self._next_health_ns:
+            self._let_sweeps_ahead()
+            self._tell_health(self._now_ns())
         self._offered()
-        self._beat(now_ns)
+        self._beat(self._now_ns())
         self.longest_turn_ns = max(self.longest_turn_ns, self._now_ns() - began_ns)
+
+    def _let_sweeps_ahead(self) -> None:
+        """Take sweeps that came meanwhile."""
+        for source, item in self._queue.take(sweeps_first):
+            self._handle(source, item)
+
+    def _handle(self, source: str, item: Item) -> None:
+        if isinstance(item, _Asked):
+            item.run()
+            return
+        self._take(source, item)
+        if isinstance(item, ScanReading):
+            self._sweep_waits = True
+        if isinstance(item, DeviceEvent):
+            self._next_health_ns = min(self._next_health_ns, self._health_told_ns + _HEALTH_GAP_NS)
 
     def _run(self) -> None:
         while not self._stopping.is_set():
@@ -196,6 +215,22 @@ class Worker:
         self._next_health_ns = now_ns + _HEALTH_PERIOD_NS
         self._guard("health", lambda: [self._health(now_ns)])
         self.longest_turn_ns = 0
+
+
+def goes_first(items: Sequence[tuple[str, Item]]) -> list[int]:
+    """Places, rising, of all that is neither a round of sonars nor a question.
+
+    None where there are news about a device: they say what the readings around them are worth.
+    """
+    if any(isinstance(item, DeviceEvent) for _, item in items):
+        return []
+    return [place for place, (_, item) in enumerate(items) if not isinstance(item, ChainReading | _Asked)]
+
+
+def sweeps_first(items: Sequence[tuple[str, Item]]) -> list[int]:
+    """The same of what came up to the newest sweep; none where there is no sweep."""
+    newest = max((place for place, (_, item) in enumerate(items) if isinstance(item, ScanReading)), default=-1)
+    return goes_first(items[: newest + 1])
 
 
 def _is_kept(item: Item) -> bool:

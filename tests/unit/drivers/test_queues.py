@@ -76,3 +76,20 @@ def test_what_can_wait_wakes_nobody_and_comes_in_order_with_what_cannot() -> Non
     assert [queue.get(GIVE_UP_S), queue.get(GIVE_UP_S)] == [("a", 6), ("b", 7)]
     queue.put("a", 8, urgent=False)
     assert queue.get(0.001) == ("a", 8)
+
+
+def test_what_is_chosen_is_taken_and_the_rest_keeps_its_order() -> None:
+    queue: BoundedQueue[int] = BoundedQueue(4)
+    assert queue.take(lambda items: range(len(items))) == []
+    for number in range(4):
+        queue.put("ab"[number % 2], number)
+    assert queue.take(lambda _: []) == []
+    assert queue.take(lambda items: [k for k, (_, item) in enumerate(items) if item in (1, 2)]) == [("b", 1), ("a", 2)]
+    queue.put("a", 4)
+    queue.put("a", 5)
+    queue.put("a", 6)  # one too many: of a, which fills it most, the oldest goes
+    assert queue.dropped() == {"a": 1}
+    assert queue.get_all(0.0) == [("b", 3), ("a", 4), ("a", 5), ("a", 6)]
+    queue.put("a", 7)
+    assert queue.take(lambda items: range(len(items))) == [("a", 7)]
+    assert queue.get_all(0.001) == [], "nothing urgent is left to wake for"

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drivers.readings import DeviceEvent, LinkState, ScanReading, WheelReading
+from drivers.readings import ChainReading, DeviceEvent, LinkState, Reading, ScanReading, WheelReading
 from mapping.frames import Pose2
 from mapping.grids.occupancy import OccupancyGrid
 from mapping.grids.patch import GridPatch
@@ -31,7 +31,7 @@ from service.rpc import CallRefused
 from service.sensors import Laser
 from service.store import MapStore, StoreNotWritten, occupancy_patch
 from service.systemd import Notifier
-from service.worker import Worker
+from service.worker import Worker, _Asked
 from tests.waiting import GIVE_UP_S, free_port
 
 SECOND = 1_000_000_000
@@ -89,6 +89,63 @@ def test_health_comes_every_second_and_at_once_when_a_device_changes() -> None:
     office.clock.turn(80_000_000)
     office.worker.turn(0.0)
     assert told_at()[-1] == 4100
+
+
+class Busy(Office):
+    """A worker whose fusion only notes what it is asked to do; while it does the first of it, readings come."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__()
+        self.done: list[str] = []
+        self.coming: list[tuple[str, Reading | DeviceEvent]] = []
+        monkeypatch.setattr(self.fusion, "stream", self._stream)
+        monkeypatch.setattr(self.fusion, "settle", lambda now_ns: self.done.append("settle"))
+        monkeypatch.setattr(self.fusion, "tick", lambda now_ns: [])
+
+    def _stream(self, source: str, item: Reading | DeviceEvent, now_ns: int) -> list[Output]:
+        self.done.append(f"{source} {item.state.name}" if isinstance(item, DeviceEvent) else source)
+        coming, self.coming = self.coming, []
+        for each in coming:
+            self.worker.sink(*each)
+        return []
+
+    def turn(self) -> list[str]:
+        self.done.clear()
+        self.worker.turn(0.0)
+        return list(self.done)
+
+
+ROUND, MOTION, SWEEP = ChainReading(SECOND, ()), WheelReading(SECOND, 0, 0, True), scan(SECOND)
+SILENT = DeviceEvent(SECOND, LinkState.SILENT, "", None)
+
+
+def test_a_sweep_goes_before_sonar_rounds_questions_and_what_else_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that comes while a round is worked on, too. Motions, which de-skew it, keep their place before it."""
+    office = Busy(monkeypatch)
+    office.worker.sink("left", ROUND)
+    office.worker._queue.put("", _Asked(lambda: office.done.append("question")))
+    for source, item in (("drive", MOTION), ("front", SWEEP), ("right", ROUND)):
+        office.worker.sink(source, item)
+    assert office.turn() == ["drive", "front", "left", "question", "right", "settle"]
+    office.worker.sink("left", ROUND)
+    office.worker.sink("right", ROUND)
+    office.coming = [("rear", ROUND), ("drive", MOTION), ("front", SWEEP), ("top", ROUND)]
+    assert office.turn() == ["left", "drive", "front", "right", "settle"]
+    assert office.turn() == ["rear", "top", "settle"]
+
+
+def test_nothing_overtakes_news_about_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A round that was heard before a chain fell silent would make it fresh again; the sweep of a laser that is back
+    would be called lost."""
+    office = Busy(monkeypatch)
+    for source, item in (("left", ROUND), ("left", SILENT), ("front", SILENT)):
+        office.worker.sink(source, item)
+    office.coming = [("front", SWEEP)]
+    assert office.turn() == ["left", "left SILENT", "front SILENT", "front", "settle"]
+    office.worker.sink("left", ROUND)
+    office.coming = [("front", SILENT), ("front", SWEEP)]
+    assert office.turn() == ["left", "settle"]
+    assert office.turn() == ["front SILENT", "front", "settle"]
 
 
 def test_motions_wake_fusion_where_they_are_read_and_otherwise_as_often_as_poses_are_told(
