@@ -6,12 +6,15 @@ hands out, so that a slow one delays neither a scan nor a grid.
 
 A maker is pure: it gets everything on this thread, asks for no time, and keeps its map in tiles of the store. What it
 cannot cope with is counted (`makers.errors`) and told once a kind; the other makers go on. Sweeps that come faster than
-makers work are lost from the front of the queue and counted (`makers.sweeps_lost`): such a map is thinner, never wrong.
+makers work are thinned: of those that wait, one goes where the robot has hardly moved since the one before it
+(`makers.sweeps_thinned`). Where none is left to thin the oldest is lost (`makers.sweeps_lost`). Such a map is thinner,
+never wrong.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,7 +25,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.frames import Pose2
+from mapping.frames import Pose2, wrap_angle
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service.errors import Trouble
@@ -35,6 +38,7 @@ F64 = NDArray[np.float64]
 T = TypeVar("T")
 
 SWEEPS_WAITING_MAX = 128
+THINNED_M, THINNED_RAD = 0.05, math.radians(2.5)  # half a step of makers of maps, and where that is not enough a whole
 _CLOUDS_WAITING_MAX = 4
 _GRIDS_WAITING_MAX = 256
 _ODOMETRY_WAITING_MAX = 4096
@@ -154,6 +158,7 @@ class _Desk:
         self.due_ns = 0
         self.is_fed = False
         self.changed: list[Rect] | None = None  # None: nothing
+        self.start_anew = maker.start_anew if isinstance(maker, DrawnFromSweeps) else None
         self.takes_odometry = maker.take_odometry if isinstance(maker, MadeOfOdometry) else None
         self.takes_clouds = maker.take_cloud if isinstance(maker, MadeOfClouds) else None
         self.takes_looks = maker.take_look if isinstance(maker, MadeOfLooks) else None
@@ -185,6 +190,7 @@ class MapMakers:
         self._complained: set[str] = set()
         self.counts = {
             "makers.sweeps_lost": 0,
+            "makers.sweeps_thinned": 0,
             "makers.grids_lost": 0,
             "makers.clouds_lost": 0,
             "makers.looks_lost": 0,
@@ -221,8 +227,17 @@ class MapMakers:
         with self._changed:
             self._sweeps.append((source, scan, map_from_sensor))
             if len(self._sweeps) > SWEEPS_WAITING_MAX:
-                self._sweeps.popleft()
-                self.counts["makers.sweeps_lost"] += 1
+                self._make_room()
+
+    def _make_room(self) -> None:
+        waiting = len(self._sweeps)
+        for steps in (1.0, 2.0):
+            if len(self._sweeps) > SWEEPS_WAITING_MAX:
+                self._sweeps = thinned(self._sweeps, steps)
+        self.counts["makers.sweeps_thinned"] += waiting - len(self._sweeps)
+        if len(self._sweeps) > SWEEPS_WAITING_MAX:
+            self._sweeps.popleft()
+            self.counts["makers.sweeps_lost"] += 1
 
     def redraw(self, sweeps: Sequence[Callable[[], Sweep]]) -> None:
         """The map was corrected: these are the sweeps it is made of, where they lie now. Never blocks."""
@@ -357,12 +372,11 @@ class MapMakers:
             except BaseException as error:  # it belongs to the thread that asked
                 result.extend((error, None))
             done.set()
-        for desk in self._desks:
-            if redrawn is not None and isinstance(desk.maker, DrawnFromSweeps):
-                desk.is_fed = True
-                self._guard(desk, partial(_draw_anew, desk.maker, redrawn))
-            if redrawn is not None and isinstance(desk.maker, TellsMotion):
-                self._guard(desk, desk.maker.map_moved)
+        if redrawn is not None:
+            self._draw_anew(redrawn)
+            for desk in self._desks:
+                if isinstance(desk.maker, TellsMotion):
+                    self._guard(desk, desk.maker.map_moved)
         for output in grids:
             self._note(self._mirror.take(output))
         for desk in self._desks:
@@ -383,6 +397,20 @@ class MapMakers:
                     self._guard(desk, partial(desk.takes_looks, look))
             if now_ns >= desk.due_ns and (desk.is_fed or desk.changed):
                 self._make(desk, now_ns)
+
+    def _draw_anew(self, sweeps: Iterable[Callable[[], Sweep]]) -> None:
+        """Every map that is made of sweeps begins again with these; each is made once for all of them."""
+        desks = []
+        for desk in self._desks:
+            if desk.start_anew is not None:
+                desks.append(desk)
+                desk.is_fed = True
+                self._guard(desk, desk.start_anew)
+        for make in sweeps if desks else ():
+            source, scan, map_from_sensor = make()
+            for desk in desks:
+                if source in desk.maker.sources:
+                    self._guard(desk, partial(desk.maker.take_sweep, source, scan, map_from_sensor))
 
     def _note(self, changed: Rect | None) -> None:
         if changed is not None:
@@ -414,13 +442,25 @@ class MapMakers:
                 log.exception("internal error in a map maker: %s", kind)
 
 
-def _draw_anew(maker: MapMaker, sweeps: Sequence[Callable[[], Sweep]]) -> None:
-    assert isinstance(maker, DrawnFromSweeps)
-    maker.start_anew()
-    for make in sweeps:
-        source, scan, map_from_sensor = make()
-        if source in maker.sources:
-            maker.take_sweep(source, scan, map_from_sensor)
+def thinned(sweeps: Sequence[Sweep], steps: float = 1.0) -> deque[Sweep]:
+    """Without those that were taken nearer than so many THINNED_M and THINNED_RAD to the last one that stays of their
+    source; its newest always stays."""
+    newest = {source: number for number, (source, _, _) in enumerate(sweeps)}
+    places: dict[str, list[float]] = {}
+    stay: deque[Sweep] = deque()
+    for number, sweep in enumerate(sweeps):
+        source, _, pose = sweep
+        place = (pose if pose.ndim == 1 else pose[len(pose) // 2]).tolist()
+        last = places.get(source)
+        if last is None or number == newest[source] or _is_apart(last, place, steps):
+            places[source] = place
+            stay.append(sweep)
+    return stay
+
+
+def _is_apart(a: Sequence[float], b: Sequence[float], steps: float) -> bool:
+    way_m, turn_rad = math.hypot(b[0] - a[0], b[1] - a[1]), abs(wrap_angle(b[2] - a[2]))
+    return way_m >= steps * THINNED_M or turn_rad >= steps * THINNED_RAD
 
 
 class SweepTap:

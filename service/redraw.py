@@ -173,7 +173,10 @@ class Redrawer:
     # --- keeping
 
     def keep_sweep(self, source: str, scan: Scan, key: int, key_pose: Pose2, ends: F64) -> None:
-        """A sweep that is drawn now: ends (2, 3) base poses at its first and last beam, in the map."""
+        """A sweep that is drawn now, unless it says nothing at all: ends (2, 3) base poses at its first and last beam,
+        in the map."""
+        if np.isnan(scan.range_m).all():
+            return
         if source in self._mounts and self._has_moved(source, Pose2(*ends[0].tolist()), _NO_CHANNELS):
             sweep = kept_sweep(
                 source, scan, key=key, in_key=_seen_from(key_pose, ends), known_bearing_rad=self._bearings.get(source)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
-from service.map_makers import SWEEPS_WAITING_MAX, MapMakers, MapView, SweepTap, Tile
+from service.map_makers import (
+    SWEEPS_WAITING_MAX,
+    THINNED_M,
+    THINNED_RAD,
+    MapMakers,
+    MapView,
+    SweepTap,
+    Tile,
+)
 from service.outputs import DocumentOut, GridOut, GridUpdateOut, Output, PoseOut
 from tests.waiting import GIVE_UP_S
 
@@ -161,14 +169,76 @@ def test_sweeps_go_to_who_wants_them_and_too_many_are_counted() -> None:
     makers, _ = makers_of(front, none)
     assert makers.sources == {"front"}
     tap = SweepTap(makers, makers.sources)
-    for _ in range(SWEEPS_WAITING_MAX + 3):
-        tap.take_sweep("front", SCAN, np.zeros(3))
+    for number in range(SWEEPS_WAITING_MAX + 3):
+        tap.take_sweep("front", SCAN, np.array([0.2 * number, 0.0, 0.0]))
     tap.take_sweep("rear", SCAN, np.zeros(3))
     makers.turn(0)
     assert len(front.sweeps) == SWEEPS_WAITING_MAX - 1
     assert (none.sweeps, none.views) == ([], [])
     assert makers.counters()["makers.sweeps_lost"] == 4
+    assert makers.counters()["makers.sweeps_thinned"] == 0
     assert len(front.views) == 1
+
+
+class Places(Notebook):
+    """Also where each sweep was taken."""
+
+    def __init__(self) -> None:
+        super().__init__("places", ["front", "rear"])
+        self.at: dict[str, list[F64]] = {"front": [], "rear": []}
+
+    def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
+        self.at[source].append(np.atleast_2d(map_from_sensor)[0])
+
+
+@pytest.mark.parametrize("beams", [1, 5])
+@pytest.mark.parametrize(("seconds", "steps"), [(5, 1.0), (10, 2.0)])
+def test_makers_that_are_busy_for_long_miss_no_place_where_the_robot_was(
+    beams: int, seconds: int, steps: float
+) -> None:
+    """At 40 Hz, one laser half a metre a second fast, another that turns."""
+    places = Places()
+    makers, _ = makers_of(places)
+    rng = np.random.default_rng(3)
+    for number in range(40 * seconds):
+        for source, pose in (("front", [0.0125 * number, 0.0, 0.0]), ("rear", [0.0, 0.0, 0.01 * number - 3.0])):
+            row = np.array(pose) + rng.normal(size=3) * 1e-4
+            makers.take_sweep(source, SCAN, row if beams == 1 else np.tile(row, (beams, 1)))
+    makers.turn(0)
+    front, rear = (np.array(at) for at in places.at.values())
+    counts = makers.counters()
+    assert (counts["makers.sweeps_lost"], counts["makers.sweeps_thinned"]) == (0, 80 * seconds - len(front) - len(rear))
+    coarseness = 2.0 * steps - 1.0  # a step may end just behind one that was thinned before
+    assert np.diff(front[:, 0]).max() < coarseness * THINNED_M + 0.013
+    assert np.diff(rear[:, 2]).max() < coarseness * THINNED_RAD + 0.011
+    assert front[0, 0] < 0.001, "the first"
+    assert front[-1, 0] > 0.5 * seconds - 0.02, "and where the robot is now"
+
+
+def test_a_map_drawn_again_takes_every_kept_sweep_once_and_each_is_made_once() -> None:
+    class Drawn(Notebook):
+        def start_anew(self) -> None:
+            self.sweeps.clear()
+
+    made: list[str] = []
+
+    def kept(source: str) -> Callable[[], tuple[str, Scan, F64]]:
+        def make() -> tuple[str, Scan, F64]:
+            made.append(source)
+            return source, SCAN, np.zeros(3)
+
+        return make
+
+    one, two, other = Drawn("one", ["front"]), Drawn("two", ["front", "rear"]), Notebook("other", ["front"])
+    makers, _ = makers_of(one, two, other)
+    makers.take_sweep("front", SCAN, np.zeros(3))
+    makers.turn(0)
+    makers.redraw([kept("front"), kept("rear"), kept("front")])
+    makers.turn(SECOND)
+    assert (one.sweeps, two.sweeps) == (["front"] * 2, ["front", "rear", "front"])
+    assert other.sweeps == ["front"], "what moves by itself, or does not care, is let be"
+    assert made == ["front", "rear", "front"]
+    assert len(one.views) == 2, "and it is told"
 
 
 def test_a_maker_that_breaks_stops_no_other(caplog: pytest.LogCaptureFixture) -> None:

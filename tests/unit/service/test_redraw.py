@@ -108,6 +108,20 @@ def test_what_moved_is_drawn_where_it_is_now_and_the_rest_stays() -> None:
     assert not redrawer.is_due(1 << 60)  # nothing is left to move
 
 
+def test_a_sweep_that_says_nothing_is_no_step_of_the_way() -> None:
+    """Sweeps of a laser that is blinded for a moment kept those away that came when it saw again."""
+    layer = building()
+    redrawer = redrawer_of(layer)
+    blind, key_pose = replace(room(), range_m=np.full(len(BEARING), math.nan)), Pose2(*KEYS[0].tolist())
+    redrawer.keep_sweep("front", blind, 0, key_pose, ends_at(0, 0.0))
+    assert redrawer.kept == 0
+    redrawer.keep_sweep("front", room(), 0, key_pose, ends_at(0, 0.01))
+    assert redrawer.kept == 1
+    nothing_there = replace(room(), range_m=np.full(len(BEARING), math.inf))
+    redrawer.keep_sweep("front", nothing_there, 0, key_pose, ends_at(0, 0.5))
+    assert redrawer.kept == 2, "nothing seen is something said"
+
+
 def test_small_shifts_are_let_be_until_they_add_up() -> None:
     layer = building()
     redrawer = redrawer_of(layer)
