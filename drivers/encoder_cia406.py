@@ -55,7 +55,10 @@ _START_REPEAT_NS = 300_000_000
 _STARTS_UNTIL_TOLD = 3
 _SYNC_PATIENCE_NS = 1_000_000_000  # started, alive, but no TPDO2 for so long: this node does not know SYNC
 _TRIPS_KEPT = 15
-_SHORTEST_ANSWER_LIMIT_NS = 40_000_000  # later ones would be taken for answers to the next SYNC
+_SHORTEST_ANSWER_LIMIT_NS = 40_000_000  # an answer that is later was lost, where another node answered
+_PAUSE_LIMIT_NS = (
+    100_000_000  # where none has answered: the bus or a computer paused, and their answers are on their way
+)
 _UNKNOWN_STEPS = 65536
 _JUMP_FACTOR = 10.0  # a count that moved ten times as far as the fastest wheel was set anew
 _NEVER = 1 << 62
@@ -480,7 +483,43 @@ class _Round:
 
     sync_ns: int
     raw: list[int | None]
-    first_answer_ns: int | None = None
+    heard_ns: list[int]  # when each came
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every node has answered."""
+        return None not in self.raw
+
+    @property
+    def first_answer_ns(self) -> int | None:
+        """None before there is one."""
+        return min((at_ns for raw, at_ns in zip(self.raw, self.heard_ns) if raw is not None), default=None)
+
+
+@dataclass(slots=True)
+class _Debt:
+    """SYNCs that were given up and that a node may answer yet.
+
+    While there are any, its next answer may be to one of them. But it answers in order, and what was held back comes at
+    once: from its first answer on, those that come before it is quiet are to the earlier SYNCs; if none comes, these
+    were lost.  open: how many may come yet.  paid: how many came.  quiet_ns: from then on none comes, once it speaks.
+    """
+
+    open: int = 0
+    paid: int = 0
+    quiet_ns: int | None = None
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether it cannot be told to which SYNC its newest answer is: some came, and some did not."""
+        return self.open > 0 and self.paid > 0
+
+    def is_due(self, now_ns: int) -> bool:
+        """Whether an answer to an earlier SYNC may still come."""
+        return self.open > 0 and (self.quiet_ns is None or now_ns < self.quiet_ns)
+
+    def forget(self) -> None:
+        self.open, self.paid, self.quiet_ns = 0, 0, None
 
 
 @dataclass(slots=True)
@@ -521,6 +560,7 @@ class _Cia406Conversation(ABC):
         self._sampling = sampling
         self._counters = SourceCounters()
         self._last_stamp_ns = -_NEVER
+        self._proved: list[Reading] = []  # complete, and told with the next frame
         period_ms = max(1, round(1e3 / sync_rate_hz))
         self._nodes = [
             _Node(
@@ -595,7 +635,7 @@ class _Cia406Conversation(ABC):
         """When the next SYNC is due, if it is not held back by answers still out."""
         if self._cyclic or not self._produce_sync or not self._all_started():
             return _NEVER
-        return self._sync_due_ns if self._round is None else self._round.sync_ns + self._answer_limit_ns()
+        return self._sync_due_ns if self._round is None else self._round_ends_ns(self._round)
 
     def prepared(self) -> CanFrame | None:
         """The SYNC of next_request_ns(), if one is to be sent then."""
@@ -613,11 +653,13 @@ class _Cia406Conversation(ABC):
         self._counters.chunks += 1
         self._counters.bytes += len(chunk.data)
         reading = handler(chunk.data, stamp_ns)
-        if reading is None:
+        if reading is None and not self._proved:
             return iter(())
+        readings = self._proved if reading is None else [*self._proved, reading]
+        self._proved = []
         self._running = True
-        self._counters.readings += 1
-        return iter((reading,))
+        self._counters.readings += len(readings)
+        return iter(readings)
 
     def farewell(self) -> Sequence[CanFrame | SetBaudRate]:
         """The nodes go back to pre-operational and send no more positions."""
@@ -654,6 +696,7 @@ class _Cia406Conversation(ABC):
         self._running = False
         self._fresh = True
         self._round: _Round | None = None
+        self._debts = [_Debt() for _ in self._nodes]
         self._sync_due_ns = 0
         self._deaf_since_ns: int | None = None
         self._trips_ns: deque[int] = deque(maxlen=_TRIPS_KEPT)  # from SYNC to the first answer
@@ -668,25 +711,49 @@ class _Cia406Conversation(ABC):
         if self._cyclic or not self._produce_sync:
             return False
         if self._round is not None:
-            if now_ns < self._round.sync_ns + self._answer_limit_ns():
+            if now_ns < self._round_ends_ns(self._round):
                 return False
-            self._counters.drop("sync_unanswered")
-            self._round = None
+            self._end_round(self._round, now_ns)
         if now_ns < self._sync_due_ns:
             return False
         late = now_ns - self._sync_due_ns > self._period_ns
         self._sync_due_ns = (now_ns if late else self._sync_due_ns) + self._period_ns
-        self._round = _Round(now_ns, [None for _ in self._nodes])
+        self._begin_round(now_ns)
         return True
+
+    def _begin_round(self, sync_ns: int) -> None:
+        self._round = _Round(sync_ns, [None for _ in self._nodes], [0 for _ in self._nodes])
 
     def _answer_limit_ns(self) -> int:
         return max(2 * self._period_ns, _SHORTEST_ANSWER_LIMIT_NS)
 
+    def _round_ends_ns(self, current: _Round) -> int:
+        """Until when nothing else is asked: so long an answer may still come to this SYNC, or show that it was not."""
+        if current.is_complete:
+            return max((debt.quiet_ns or 0 for debt in self._debts), default=0)
+        return current.sync_ns + self._answer_limit_ns()
+
+    def _end_round(self, current: _Round, now_ns: int) -> None:
+        """The next SYNC goes out. A complete round is a reading by now, unless it is not clear whose answers it has;
+        else those that did not answer may do so yet."""
+        self._round = None
+        if current.is_complete:
+            if any(debt.is_doubtful or debt.is_due(now_ns) for debt in self._debts):
+                self._counters.drop("ambiguous_pdo")
+            else:
+                self._proved.append(self._reading_of(current, now_ns))
+        else:
+            self._counters.drop("sync_unanswered")
+        for debt, raw in zip(self._debts, current.raw):
+            if debt.quiet_ns is not None and now_ns >= debt.quiet_ns:
+                debt.forget()
+            debt.open += raw is None
+
     def _take_sync(self, data: bytes, stamp_ns: int) -> None:
         if not self._produce_sync:
             if self._round is not None:
-                self._counters.drop("sync_unanswered")
-            self._round = _Round(stamp_ns, [None for _ in self._nodes])
+                self._end_round(self._round, stamp_ns)
+            self._begin_round(stamp_ns)
         elif self._round is None or self._round.first_answer_ns is not None:  # else it may be the echo of our own
             self._foreign_sync = True
             self._counters.drop("foreign_sync")
@@ -696,29 +763,41 @@ class _Cia406Conversation(ABC):
         node.hear(stamp_ns)
         if self._cyclic or not self._all_started():
             return None
-        current = self._round
+        current, debt = self._round, self._debts[side]
+        is_due = debt.is_due(stamp_ns)
+        if is_due:
+            debt.quiet_ns = stamp_ns + 3 * self._period_ns // 4
         if current is None or current.raw[side] is not None:
-            self._counters.drop("extra_pdo")
+            if not is_due:
+                self._counters.drop("extra_pdo")
+                return None
+            debt.open, debt.paid = debt.open - 1, debt.paid + 1  # its SYNC is counted as unanswered
+            if debt.open == 0:
+                debt.forget()
+        if current is None:
             return None
         raw = node.position(data)
         if raw is None:
             return None
-        current.raw[side] = raw
-        if current.first_answer_ns is None:
-            current.first_answer_ns = stamp_ns
-        answers = [answer for answer in current.raw if answer is not None]
-        if len(answers) < len(self._nodes):
+        current.raw[side], current.heard_ns[side] = raw, stamp_ns
+        if not current.is_complete or any(debt.open > 0 for debt in self._debts):
             return None
         self._round = None
-        self._deaf_since_ns = stamp_ns
-        return self._reading(answers, self._sampled_ns(current.sync_ns, current.first_answer_ns))
+        return self._reading_of(current, stamp_ns)
+
+    def _reading_of(self, current: _Round, now_ns: int) -> Reading:
+        first_ns = current.first_answer_ns
+        assert first_ns is not None
+        self._deaf_since_ns = now_ns
+        answers = [answer for answer in current.raw if answer is not None]
+        return self._reading(answers, self._sampled_ns(current.sync_ns, first_ns))
 
     def _sampled_ns(self, sync_ns: int, answer_ns: int) -> int:
         """When the nodes heard SYNC: between its sending and the first answer.
 
         The way there and back is about equally long (adapter, host), so the middle is right to within half their
-        difference. Longer than the limit no answer takes, or the next SYNC would have been sent: then this program was
-        held up while the answer lay waiting, and the ways took what they usually take.
+        difference. Longer than the limit no answer takes by itself: then this program was held up while the answer lay
+        waiting, or the bus was, and the ways took what they usually take.
         """
         trip_ns = answer_ns - sync_ns
         if not self._produce_sync or trip_ns <= self._answer_limit_ns():

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import canopen
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drivers.canopen_sdo import TIMED_OUT, Download, SdoClient, SdoDone, Upload
 from drivers.conversation import CanFrame
@@ -690,6 +692,96 @@ def test_late_answers_are_not_taken_for_the_next_sync() -> None:
     before = len(bench.syncs())
     bench.run(30)
     assert len(bench.syncs()) - before <= 1
+
+
+class Slow(Bench):
+    """A bus on which positions are held back or lost on their way to us; the nodes take them as they hear SYNC."""
+
+    def __init__(self, conversation: Cia406PairConversation | None = None) -> None:
+        super().__init__(conversation)
+        self.held: list[CanFrame] = []
+        self.fate = {LEFT: "keep", RIGHT: "keep"}
+        self.lost = self._is_away
+
+    def _is_away(self, frame: CanFrame) -> bool:
+        fate = self.fate.get(frame.can_id - 0x280, "keep")
+        if fate == "hold":
+            self.held.append(frame)
+        return fate != "keep"
+
+    def let_go(self) -> list[WheelReading]:
+        """What was held back comes at once, in order."""
+        held, self.held = self.held, []
+        self.fate = {LEFT: "keep", RIGHT: "keep"}
+        return [reading for reading in self.say(*held) if isinstance(reading, WheelReading)]
+
+    def offsets(self, readings: Sequence[WheelReading]) -> set[int]:
+        """How far counts are off those at the SYNC by which each reading is stamped, where wheels move 4 and -4 a
+        millisecond: one number if each is of its own SYNC."""
+        syncs = self.syncs()
+        off = set()
+        for reading in readings:
+            way = 4 * max(sync_ns for sync_ns in syncs if sync_ns < reading.stamp_ns) // MS
+            off |= {reading.left_ticks - way, -reading.right_ticks - way}
+        return off
+
+
+@pytest.mark.parametrize("late_ms", [15, 38, 45, 70, 95, 130, 240, 480])
+def test_answers_that_a_busy_computer_holds_back_are_those_to_their_own_sync(late_ms: int) -> None:
+    """Behind the next SYNC they were taken for those to it, and its own were dropped: each SYNC counted twice."""
+    bench = Slow()
+    readings = bench.run(200, move=(4, -4))
+    bench.fate = {LEFT: "hold", RIGHT: "hold"}
+    readings += bench.run(late_ms, move=(4, -4))
+    readings += bench.let_go() + bench.run(300, move=(4, -4))
+    assert len(bench.offsets(readings)) == 1
+    assert all(reading.continuous for reading in readings[1:])
+    assert set(bench.drops) <= {"sync_unanswered"}
+    assert len(bench.syncs()) - len(readings) == bench.drops.get("sync_unanswered", 0) <= late_ms // 40, "counted once"
+
+
+@pytest.mark.parametrize("side", [LEFT, RIGHT])
+@pytest.mark.parametrize("late_ms", [15, 45, 60])
+def test_one_late_node_is_never_paired_with_another_sync(side: int, late_ms: int) -> None:
+    bench = Slow()
+    readings = bench.run(200, move=(4, -4))
+    bench.fate[side] = "hold"
+    readings += bench.run(late_ms, move=(4, -4))
+    readings += bench.let_go() + bench.run(300, move=(4, -4))
+    assert len(bench.offsets(readings)) == 1
+    assert set(bench.drops) <= {"sync_unanswered"}
+    assert len(bench.syncs()) - len(readings) == bench.drops.get("sync_unanswered", 0) <= 1
+
+
+def test_answers_of_which_it_is_not_clear_whose_they_are_are_counted_once() -> None:
+    """Of six SYNCs that were out each node answers five, late: the newest may be to the fifth or the sixth."""
+    bench = Slow()
+    readings = bench.run(200, move=(4, -4))
+    bench.fate = {LEFT: "hold", RIGHT: "hold"}
+    readings += bench.run(215, move=(4, -4))
+    del bench.held[-2:]
+    readings += bench.let_go() + bench.run(300, move=(4, -4))
+    assert len(bench.offsets(readings)) == 1
+    assert bench.drops == {"sync_unanswered": 5, "ambiguous_pdo": 1}
+    assert len(bench.syncs()) - len(readings) == 6
+
+
+FATE = st.sampled_from(["keep", "hold", "lose"])
+
+
+@given(st.lists(st.tuples(FATE, FATE, st.integers(1, 90)), max_size=12))
+def test_whatever_is_held_back_or_lost_no_reading_is_of_another_sync(events: list[tuple[str, str, int]]) -> None:
+    bench = Slow()
+    readings = bench.run(150, move=(4, -4))
+    for left, right, ms in events:
+        bench.fate = {LEFT: left, RIGHT: right}
+        readings += bench.run(ms, move=(4, -4))
+        readings += bench.let_go()
+    readings += bench.run(300, move=(4, -4))
+    assert len(bench.offsets(readings)) == 1
+    assert set(bench.drops) <= {"sync_unanswered", "ambiguous_pdo"}
+    counted = sum(bench.drops.values())
+    assert counted <= len(bench.syncs()) - len(readings) <= counted + 1, "each SYNC is a reading, or counted once"
 
 
 def test_node_without_sync_is_read_by_timer_and_interpolated() -> None:
