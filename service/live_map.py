@@ -311,11 +311,14 @@ def replace_tiles(layer: BuildingLayer, tiles: Iterable[Tile]) -> None:
 
 
 def occupancy_of(changed: Iterable[GridTile]) -> list[Tile]:
-    """Percentages of tiles, made from their copies: for the thread that writes."""
+    """Percentages of tiles of one grid, made from their copies: for the thread that writes."""
     found: list[Tile] = []
+    alone: OccupancyGrid | None = None  # one for all: making its tables takes longer than a tile
     for tile in changed:
-        model: Model = tile.model
-        alone = OccupancyGrid(resolution_m=tile.resolution_m, model=model, max_tiles=1)
+        if alone is None:
+            model: Model = tile.model
+            alone = OccupancyGrid(resolution_m=tile.resolution_m, model=model, max_tiles=1)
+        alone.start_anew()
         alone.load_tile(tile.tile_row, tile.tile_col, tile.payload())
         alone.show_walls(tile.tile_row, tile.tile_col, tile.walls)
         found.extend(occupancy_tiles(alone.patch(whole_tiles=True), TILE, also_unknown=True))
