@@ -80,13 +80,13 @@ def _code_of_files(lines: list[str]) -> list[tuple[int, int, dict[str, int]]]:
     found: list[tuple[int, int, dict[str, int]]] = []
     wanted = False
     for line in lines:
-        if head := _RANGE.match(line):
-            wanted = head[3] in ("r-xp", "r--p")
+        if line.endswith(" kB"):  # nine of ten lines, and most of them of others
             if wanted:
+                name, _, rest = line.partition(":")
+                found[-1][2][name] = int(rest.split()[0])
+        else:
+            head = _RANGE.match(line)
+            wanted = head is not None and head[3] in ("r-xp", "r--p")
+            if head is not None and wanted:
                 found.append((int(head[1], 16), int(head[2], 16), {}))
-        elif re.match(r"^[0-9a-f]+-[0-9a-f]+ ", line):
-            wanted = False
-        elif wanted and line.endswith(" kB"):
-            name, _, rest = line.partition(":")
-            found[-1][2][name] = int(rest.split()[0])
     return found
