@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import WrongUsage
+from service.tls import TlsFiles
 
 FILE_NAME = "umfeld.toml"
 ENVIRONMENT_PREFIX = "UMFELD__"  # UMFELD__ROBOT__ID=artos sets robot.id
@@ -101,6 +102,18 @@ def daemon_endpoint(path: Path | None) -> str:
         return str(listen[0])
     except (WrongUsage, LookupError, TypeError):
         return DEFAULT_ENDPOINT
+
+
+def daemon_tls(path: Path | None) -> TlsFiles | None:
+    """The certificate of [network.tls], for a client of this configuration's daemon; None if there is none."""
+    try:
+        named = read_layers(path).data["network"]["tls"]
+        authority, certificate, key = (
+            str(named[each]) for each in ("root_ca_certificate", "listen_certificate", "listen_private_key")
+        )
+        return TlsFiles(authority, certificate, key)
+    except (WrongUsage, LookupError, TypeError):
+        return None
 
 
 def origin_of(origins: Mapping[KeyPath, str], path: KeyPath) -> str:

@@ -53,9 +53,10 @@ from service.rpc import CallRefused
 from service.sensors import Chain, Laser
 from service.store import MapStore, Provenance
 from service.systemd import Notifier
+from service.tls import TlsFiles
 from service.warm_up import StoppedWhileCompiling, warm_up
 from service.worker import Worker
-from service.zenoh_session import NetworkSettings, TlsFiles
+from service.zenoh_session import NetworkSettings
 
 if TYPE_CHECKING:
     from mapping.grids.occupancy import OccupancyGrid
@@ -358,7 +359,7 @@ class Daemon:
 
     def _other_troubles(self, now_ns: int) -> list[str]:
         mavlink = None if self._mavlink is None else self._mavlink.trouble()
-        troubles = (self._publisher.trouble(now_ns), self._recorder.trouble(), mavlink)
+        troubles = (*self._publisher.troubles(now_ns), self._recorder.trouble(), mavlink)
         return [trouble for trouble in troubles if trouble is not None]
 
     def _offer(self, output: Output) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from service.config import Config
 from service.errors import Trouble
 from service.health import identity_text, trouble_of
 from service.locks import Claims
+from service.tls import TlsFiles, TlsTrouble, own_certificate
 
 _LISTEN_S = 1.0  # so long after the first reading, for a rate
 _OPEN_S = 1.0  # a port that could not be opened until then is not there
@@ -130,6 +132,14 @@ def check_surroundings(config: Config) -> list[str]:
         problem = _address_problem(endpoint)
         if problem is not None:
             problems.append(problem)
+    if config.network.tls is not None:
+        tls = config.network.tls
+        files = TlsFiles(tls.root_ca_certificate, tls.listen_certificate, tls.listen_private_key, tls.mutual)
+        try:
+            trouble = own_certificate(files).trouble(time.time(), config.network.listen)
+        except TlsTrouble as fault:
+            trouble = str(fault)
+        problems += [] if trouble is None else [f"[network.tls] {trouble}"]
     if config.store.enabled:
         folder = config.store_path().parent
         while not folder.exists() and folder != folder.parent:

@@ -43,6 +43,7 @@ from service.outputs import (
 from service.payloads import Encoder, Message, RobotInfo
 from service.ros import RosMirror, RosSettings
 from service.rpc import Calls
+from service.tls import Certificate, own_certificate
 from service.topics import Lane
 from service.zenoh_session import NetworkSettings, Readers
 
@@ -151,6 +152,8 @@ class Publisher:
         self._session: Any = None
         self._token: Any = None
         self._namesakes: Namesakes | None = None
+        self._certificate: Certificate | None = None
+        self._told_of_certificate: str | None = None
         self._outboxes = {lane: Outbox() for lane in Lane}
         self._publishers: dict[str, tuple[Any, Readers | None]] = {}
         self._last: dict[str, _Kept] = {}
@@ -170,6 +173,8 @@ class Publisher:
 
         announce: say that the robot is there; else announce() does, when it can answer every call.
         """
+        if self._network.tls is not None:
+            self._certificate = own_certificate(self._network.tls)
         self._session = zenoh_session.open_router(self._network)
         if self._ros_settings is not None:
             self._ros = RosMirror(self._session, self._ros_settings)
@@ -186,9 +191,19 @@ class Publisher:
         self._token = self._session.liveliness().declare_token(f"{self.base}/{topics.ALIVE}")
         self._namesakes = Namesakes(self._session, self.base)
 
-    def trouble(self, now_ns: int) -> str | None:
+    def troubles(self, now_ns: int) -> list[str]:
         """What is wrong with the network, in words; for one thread."""
-        return None if self._namesakes is None else self._namesakes.trouble(now_ns)
+        namesakes = None if self._namesakes is None else self._namesakes.trouble(now_ns)
+        return [each for each in (namesakes, self._certificate_trouble(now_ns)) if each is not None]
+
+    def _certificate_trouble(self, now_ns: int) -> str | None:
+        if self._certificate is None:
+            return None
+        trouble = self._certificate.trouble(self._clock.wall_from_monotonic_ns(now_ns) / 1e9, self._network.listen)
+        if trouble is not None and trouble != self._told_of_certificate:
+            _LOG.error("%s", trouble)
+        self._told_of_certificate = trouble
+        return trouble
 
     def _spawn(self, name: str, target: Callable[..., None], *arguments: object) -> None:
         thread = threading.Thread(target=target, args=arguments, name=name, daemon=True)

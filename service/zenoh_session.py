@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,10 +20,11 @@ from typing import Any
 import zenoh
 from zenoh import ext, handlers
 
+from service.config_files import DEFAULT_ENDPOINT, daemon_endpoint, daemon_tls, find_config
 from service.errors import Trouble
+from service.tls import TlsFiles, why_refused
 from service.topics import ALIVE, RPC, Priority
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 HEARTBEAT_S = 0.5
 _LEASE_MS = 3000
 _PORT_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
@@ -44,6 +46,10 @@ class NoDaemon(NetworkTrouble):
     """Nobody answers at the endpoint of the daemon."""
 
 
+class NotAdmitted(NetworkTrouble):
+    """Something answers at the endpoint of the daemon, and does not let us in."""
+
+
 class WrongAddress(NetworkTrouble):
     """What was given as an endpoint is none."""
 
@@ -52,31 +58,6 @@ class WrongAddress(NetworkTrouble):
 
 class CallFailed(NetworkTrouble):
     """A call was answered with an error, or not at all."""
-
-
-@dataclass(frozen=True, slots=True)
-class TlsFiles:
-    """PEM files of the daemon. mutual: clients must show a certificate of the same authority."""
-
-    root_ca_certificate: str
-    certificate: str
-    private_key: str
-    mutual: bool = True
-
-    def values(self) -> dict[str, object]:
-        """As Zenoh's configuration names them; used for listening and for links to other routers."""
-        return {
-            f"transport/link/tls/{key}": value
-            for key, value in {
-                "root_ca_certificate": self.root_ca_certificate,
-                "listen_certificate": self.certificate,
-                "listen_private_key": self.private_key,
-                "connect_certificate": self.certificate,
-                "connect_private_key": self.private_key,
-                "enable_mtls": self.mutual,
-                "close_link_on_expiration": True,
-            }.items()
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +96,15 @@ def open_router(settings: NetworkSettings) -> zenoh.Session:
         raise _explain_open(error, settings.listen) from error
 
 
-def open_client(endpoint: str = DEFAULT_ENDPOINT, *, zenoh_config: Path | None = None) -> zenoh.Session:
-    """A session for status, view and tools. NoDaemon if nothing answers at the endpoint, WrongAddress if it is none."""
+def open_client(
+    endpoint: str = DEFAULT_ENDPOINT, *, zenoh_config: Path | None = None, tls: TlsFiles | None = None
+) -> zenoh.Session:
+    """A session for status, view and tools. NoDaemon if nothing answers at the endpoint, WrongAddress if it is none.
+
+    tls: our certificate, for a tls/ endpoint.  zenoh_config: may bring one, too.
+    """
     _check_address(endpoint)
+    tls = tls if endpoint.startswith(("tls/", "quic/")) else None
     config = _base_config(zenoh_config)
     _insert(
         config,
@@ -127,15 +114,37 @@ def open_client(endpoint: str = DEFAULT_ENDPOINT, *, zenoh_config: Path | None =
             "connect/endpoints": [endpoint],
             "transport/link/tx/lease": _LEASE_MS,
             "connect/retry": _RETRY,
+            **({} if tls is None else tls.values()),
         },
     )
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
+        refusal = _why_refused(endpoint, tls, zenoh_config)
+        if refusal is not None:
+            raise NotAdmitted(f"the daemon at {endpoint} cannot be spoken to: {refusal}") from error
         raise NoDaemon(
             f"no daemon answers at {endpoint}: start one with `umfeld run`, or name its address with --connect"
             f" (zenoh: {_first_line(error)})"
         ) from error
+
+
+def _why_refused(endpoint: str, tls: TlsFiles | None, zenoh_config: Path | None) -> str | None:
+    """Why what listens at an endpoint does not let us in; None if it may not be there at all."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol == "unixsock-stream" and Path(address).exists() and not os.access(address, os.W_OK):
+        return (
+            f"{address} is another user's; run this as the daemon's user, for instance `sudo -u umfeld umfeld status`"
+        )
+    if protocol == "tls" and zenoh_config is None:  # else we do not know what it brings
+        return why_refused(endpoint, tls)
+    return None
+
+
+def client_for(connect: str | None, config: Path | None) -> Client:
+    """The client of a command: connect, or where the configuration's daemon listens, with the certificate it names."""
+    path = find_config(config)
+    return Client(connect or daemon_endpoint(path), tls=daemon_tls(path))
 
 
 def _check_address(endpoint: str) -> None:
@@ -307,10 +316,12 @@ def received(sample: zenoh.Sample) -> Received:
 class Client:
     """What status, view and the map commands need of a running daemon. A context manager."""
 
-    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, zenoh_config: Path | None = None) -> None:
+    def __init__(
+        self, endpoint: str = DEFAULT_ENDPOINT, *, zenoh_config: Path | None = None, tls: TlsFiles | None = None
+    ) -> None:
         """NoDaemon if nothing answers."""
         self.endpoint = endpoint
-        self.session = open_client(endpoint, zenoh_config=zenoh_config)
+        self.session = open_client(endpoint, zenoh_config=zenoh_config, tls=tls)
 
     def __enter__(self) -> Client:
         return self
@@ -336,6 +347,11 @@ class Client:
         bases = self.bases()
         if len(bases) == 1:
             return bases[0]
+        if not bases and self.endpoint.startswith(("tls/", "quic/")):
+            raise NoDaemon(
+                f"no daemon is seen at {self.endpoint}, and yet something lets us in: its access rules do not know the "
+                "name (CN) of our certificate (deploy/README-security.md), or its kernels are still compiled"
+            )
         if not bases:
             raise NoDaemon(
                 f"no daemon is alive at {self.endpoint}: start one with `umfeld run`; after an update it answers only "

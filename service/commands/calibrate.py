@@ -72,11 +72,10 @@ def calibrate(
 
 
 def _ask_daemon(connect: str | None, config: Path | None, robot: str | None, *, as_json: bool) -> None:
-    from service.config_files import daemon_endpoint, find_config
     from service.errors import Trouble
-    from service.zenoh_session import Client
+    from service.zenoh_session import client_for
 
-    with Client(connect or daemon_endpoint(find_config(config))) as client:
+    with client_for(connect, config) as client:
         base = client.only_base(None if robot is None else f"robots/{robot}")
         payloads = [each.payload for each in client.get(f"{base}/calibration")]
     if not payloads:

@@ -369,10 +369,9 @@ def build(
 
 
 def _client(connect: str | None, config: Path | None) -> Client:
-    from service.config_files import daemon_endpoint, find_config
-    from service.zenoh_session import Client
+    from service.zenoh_session import client_for
 
-    return Client(connect or daemon_endpoint(find_config(config)))
+    return client_for(connect, config)
 
 
 def _base(client: Client, robot: str | None) -> str:

@@ -74,11 +74,10 @@ def record(
 
 def _client(connect: str | None, config: Path | None) -> Client | None:
     """A connection to a running daemon, None if there is none."""
-    from service.config_files import daemon_endpoint, find_config
-    from service.zenoh_session import Client, NoDaemon
+    from service.zenoh_session import NoDaemon, client_for
 
     try:
-        client = Client(connect or daemon_endpoint(find_config(config)))
+        client = client_for(connect, config)
     except NoDaemon:
         return None
     if client.bases():

@@ -33,10 +33,9 @@ def status(
 
     Example: umfeld status --json
     """
-    from service.config_files import daemon_endpoint, find_config
-    from service.zenoh_session import Client
+    from service.zenoh_session import client_for
 
-    with Client(connect or daemon_endpoint(find_config(config))) as client:
+    with client_for(connect, config) as client:
         base = client.only_base(None if robot is None else f"robots/{robot}")
         values = {each.key.removeprefix(f"{base}/"): each.payload for each in client.get(f"{base}/health/json")}
         for key in ("pose", "map/agreement", "calibration"):

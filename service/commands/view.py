@@ -18,6 +18,7 @@ from service.errors import Trouble
 
 if TYPE_CHECKING:
     from service.relay import Sample
+    from service.tls import TlsFiles
     from service.view import Relay
     from service.zenoh_session import Client
 
@@ -49,16 +50,17 @@ def view(
 
     Example: umfeld view --port 8765, and from a desk: ssh -L 8765:127.0.0.1:8765 robot
     """
-    from service.config_files import daemon_endpoint, find_config
+    from service.config_files import daemon_endpoint, daemon_tls, find_config
 
-    endpoint = connect or daemon_endpoint(find_config(config))
+    path = find_config(config)
+    endpoint = connect or daemon_endpoint(path)
     try:
-        asyncio.run(_serve(endpoint, base, port, allow_host or []))
+        asyncio.run(_serve(endpoint, daemon_tls(path), base, port, allow_host or []))
     except OSError as error:
         raise Trouble(f"the page's port {port} cannot be had ({error.strerror}): choose another with --port") from error
 
 
-async def _serve(endpoint: str, base: str, port: int, allow_host: Sequence[str]) -> None:
+async def _serve(endpoint: str, tls: TlsFiles | None, base: str, port: int, allow_host: Sequence[str]) -> None:
     serve, loopback_names = _page_server()
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for name in (signal.SIGINT, signal.SIGTERM):
@@ -70,7 +72,7 @@ async def _serve(endpoint: str, base: str, port: int, allow_host: Sequence[str])
         loop.call_soon_threadsafe(stop.set)
 
     await serve(
-        lambda relay: _receive_when_there(endpoint, base, relay, give_up),
+        lambda relay: _receive_when_there(endpoint, base, relay, give_up, tls=tls),
         port=port,
         on_ready=lambda address: print(address, flush=True),
         hosts=loopback_names | {name.lower() for name in allow_host},
@@ -95,7 +97,7 @@ def _page_server() -> tuple[Callable[..., Awaitable[None]], frozenset[str]]:
 
 
 def _receive_when_there(
-    endpoint: str, base: str, relay: Relay, give_up: Callable[[Trouble], None]
+    endpoint: str, base: str, relay: Relay, give_up: Callable[[Trouble], None], *, tls: TlsFiles | None = None
 ) -> Callable[[], None]:
     """Receive as soon as a daemon answers, which is tried for ever; returns what ends it. Says in a line that it waits.
 
@@ -106,7 +108,7 @@ def _receive_when_there(
 
     def run() -> None:
         try:
-            client = _client_when_there(endpoint, stopping)
+            client = _client_when_there(endpoint, tls, stopping)
         except Trouble as trouble:
             give_up(trouble)
             return
@@ -125,14 +127,14 @@ def _receive_when_there(
     return end
 
 
-def _client_when_there(endpoint: str, stopping: threading.Event) -> Client | None:
+def _client_when_there(endpoint: str, tls: TlsFiles | None, stopping: threading.Event) -> Client | None:
     """The session, once it can be had; None if told to stop before."""
     from service.zenoh_session import Client, NoDaemon
 
     has_waited = False
     while not stopping.is_set():
         try:
-            client = Client(endpoint)
+            client = Client(endpoint, tls=tls)
         except NoDaemon:
             if not has_waited:
                 typer.echo(

@@ -298,22 +298,22 @@ def test_another_daemon_of_this_name_is_told_with_its_repair(
     publisher: Publisher, endpoint: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Two robots with one id behind linked routers: whoever reads gets both, mixed, and nothing said so."""
-    assert publisher.trouble(0) is None
+    assert not publisher.troubles(0)
     other_robot = Publisher("robots/r2", NetworkSettings((free_endpoint(),), (endpoint,)), clock=SystemClock())
     twin = Publisher(BASE, NetworkSettings((free_endpoint(),), (endpoint,)), clock=SystemClock())
     other_robot.start()
     twin.start()
     stamps = count(0, SECOND)  # a second passes with each question
 
-    trouble = wait_until(lambda: publisher.trouble(next(stamps)))
+    trouble = wait_until(lambda: publisher.troubles(next(stamps)))[0]
     assert re.fullmatch(r"another daemon calls itself r1 too \(process \d+ on \S+\) .*\[robot\] id", trouble)
     assert next(stamps) > BELIEVED_AFTER_NS, "our own earlier self may linger behind another router for a lease"
-    assert publisher.trouble(next(stamps)) == trouble
-    assert wait_until(lambda: twin.trouble(next(stamps)))
-    assert other_robot.trouble(next(stamps)) is None
+    assert publisher.troubles(next(stamps)) == [trouble]
+    assert wait_until(lambda: twin.troubles(next(stamps)))
+    assert not other_robot.troubles(next(stamps))
     assert [record.message for record in caplog.records] == [trouble] * 2, "each tells it once"
     assert twin.close(GIVE_UP_S)
-    wait_until(lambda: publisher.trouble(next(stamps)) is None)
+    wait_until(lambda: not publisher.troubles(next(stamps)))
     assert other_robot.close(GIVE_UP_S)
 
 

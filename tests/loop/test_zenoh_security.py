@@ -19,7 +19,8 @@ from mapping.scan import Scan
 from service.clock import SystemClock
 from service.outputs import GridOut, ScanOut
 from service.publisher import Publisher
-from service.zenoh_session import CallFailed, Client, NetworkSettings, NetworkTrouble, TlsFiles
+from service.tls import TlsFiles, TlsTrouble, own_certificate
+from service.zenoh_session import CallFailed, Client, NetworkSettings, NetworkTrouble, NoDaemon, NotAdmitted
 from tests.clients import PatientClient
 from tests.waiting import GIVE_UP_S, free_port, wait_for
 
@@ -48,6 +49,10 @@ issue viewer ca viewer DNS:viewer
 issue operator ca operator DNS:operator
 issue stranger ca stranger DNS:stranger
 issue forged otherca operator DNS:operator
+openssl x509 -req -in viewer.csr -CA ca.crt -CAkey ca.key -CAcreateserial -days -1 -extfile viewer.ext -out old.crt
+cp viewer.key old.key
+openssl x509 -req -in mapper.csr -CA ca.crt -CAkey ca.key -CAcreateserial -days -1 -extfile mapper.ext -out gone.crt
+cp mapper.key gone.key
 """
 
 
@@ -187,3 +192,102 @@ def test_the_file_forbids_plain_listening() -> None:
     settings = NetworkSettings(listen=("tcp/127.0.0.1:0",), zenoh_config=DEPLOY / "zenoh-security.json5")
     with pytest.raises(NetworkTrouble, match=r"cannot listen on tcp/127\.0\.0\.1:0"):
         Publisher(BASE, settings, clock=SystemClock()).start()
+
+
+def files_of(certificates: Path, name: str, authority: str = "ca", key: str | None = None) -> TlsFiles:
+    return TlsFiles(
+        str(certificates / f"{authority}.crt"),
+        str(certificates / f"{name}.crt"),
+        str(certificates / f"{key or name}.key"),
+    )
+
+
+def test_a_command_with_a_certificate_comes_in(
+    publisher: Publisher, certificates: Path, endpoints: tuple[str, str]
+) -> None:
+    """As `umfeld status` on a desk does, whose configuration names the certificate."""
+
+    def comes_in() -> bool:
+        with Client(endpoints[1], tls=files_of(certificates, "viewer")) as client:
+            return client.bases() == [BASE]
+
+    wait_until(comes_in)
+
+
+@pytest.mark.parametrize(
+    ("name", "authority", "words"),
+    [
+        (None, "ca", r"it refuses no certificate: it asks for one: name yours in \[network.tls\]"),
+        ("old", "ca", r"it refuses \S+old.crt: it has expired: issue a new one"),
+        ("forged", "ca", r"it refuses \S+forged.crt: it is not of the authority that the daemon trusts"),
+        ("viewer", "otherca", r"the certificate that it shows is refused here: unable to get local issuer"),
+    ],
+)
+def test_who_is_not_let_in_is_told_why(
+    publisher: Publisher, certificates: Path, endpoints: tuple[str, str], name: str | None, authority: str, words: str
+) -> None:
+    """Zenoh says "Unable to connect" to all of them, and we said that there is no daemon."""
+    with pytest.raises(NotAdmitted, match=words):
+        Client(endpoints[1], tls=None if name is None else files_of(certificates, name, authority))
+
+
+def test_a_name_that_the_rules_do_not_know_is_told(
+    publisher: Publisher, certificates: Path, endpoints: tuple[str, str]
+) -> None:
+    tls = files_of(certificates, "stranger")
+    with Client(endpoints[1], tls=tls) as client, pytest.raises(NoDaemon, match=r"do not know the name \(CN\)"):
+        client.only_base()
+
+
+def test_a_daemon_whose_certificate_nobody_accepts_says_so(
+    certificates: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    files = files_of(certificates, "gone")
+    made = Publisher("robots/r2", NetworkSettings((endpoint,), tls=files), clock=SystemClock())
+    made.start()
+    try:
+        (trouble,) = made.troubles(SystemClock().now_ns())
+        assert trouble.endswith("has expired, every client refuses it; issue a new one and start the daemon again")
+        assert [record.message for record in caplog.records] == [trouble]
+        with pytest.raises(NotAdmitted, match=r"refused here: certificate has expired"):
+            Client(endpoint, tls=files_of(certificates, "viewer"))
+    finally:
+        assert made.close(GIVE_UP_S)
+
+
+@pytest.mark.parametrize(
+    ("name", "authority", "key", "words"),
+    [
+        ("nosuch", "ca", "mapper", r"nosuch.crt: there is no such file"),
+        ("mapper", "ca", "viewer", r"viewer.key: is not the key of \S+mapper.crt"),
+        ("mapper", "viewer.key", "mapper", r"viewer.key.crt: there is no such file"),
+    ],
+)
+def test_files_that_no_daemon_can_use_are_told_by_name(
+    certificates: Path, name: str, authority: str, key: str, words: str
+) -> None:
+    with pytest.raises(TlsTrouble, match=words):
+        own_certificate(files_of(certificates, name, authority, key))
+
+
+def test_what_holds_no_certificate_is_told_by_name(certificates: Path) -> None:
+    key = str(certificates / "mapper.key")
+    certificate = str(certificates / "mapper.crt")
+    with pytest.raises(TlsTrouble, match=r"mapper.key: holds no certificate of an authority"):
+        own_certificate(TlsFiles(key, certificate, key))
+    with pytest.raises(TlsTrouble, match=r"mapper.key: holds no certificate;"):
+        own_certificate(TlsFiles(str(certificates / "ca.crt"), key, key))
+    with pytest.raises(TlsTrouble, match=r"mapper.crt: holds no key without a password"):
+        own_certificate(TlsFiles(str(certificates / "ca.crt"), certificate, certificate))
+
+
+def test_what_clients_will_find_wrong_with_a_certificate(certificates: Path) -> None:
+    found = own_certificate(files_of(certificates, "mapper"))
+    assert found.names == ("localhost", "127.0.0.1")
+    today_s = found.from_s + 60.0
+    assert found.trouble(today_s, ["tls/127.0.0.1:7447", "tls/localhost:1", "tls/[::]:2", "tcp/10.0.0.1:3"]) is None
+    assert "does not name 192.168.1.20" in str(found.trouble(today_s, ["tls/192.168.1.20:7447"]))
+    assert "is valid only later" in str(found.trouble(found.from_s - 60.0))
+    assert "expires in 13 days" in str(found.trouble(found.until_s - 13.2 * 86400))
+    assert "has expired" in str(found.trouble(found.until_s + 1.0))
