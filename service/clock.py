@@ -20,15 +20,26 @@ class Clock(Protocol):
 class SystemClock:
     """The machine's clocks."""
 
+    def __init__(self) -> None:
+        self._offset_ns = wall_offset_ns()
+
     def now_ns(self) -> int:
         return time.monotonic_ns()
 
     def wall_from_monotonic_ns(self, stamp_ns: int) -> int:
-        """Follows steps of the wall clock at once: a label tells when something was by today's reckoning."""
-        return stamp_ns + wall_offset_ns()
+        """Follows steps of the wall clock at once: a label tells when something was by today's reckoning.
+
+        Two readings of the clocks differ by some hundred nanoseconds. One moment has one label all the same, on every
+        key: else what happened at once seems to run backwards, and ROS 2's transforms end just before their scan.
+        """
+        offset_ns = wall_offset_ns()
+        if abs(offset_ns - self._offset_ns) > _STEADY_NS:
+            self._offset_ns = offset_ns
+        return stamp_ns + self._offset_ns
 
 
 _AT_ONCE_NS = 50_000
+_STEADY_NS = 100_000
 _TRIES = 5
 
 

@@ -56,7 +56,17 @@ from mapping.scan import Scan
 from mapping.sectors.inputs import without_self
 from service.align import WaitingRoom
 from service.mounts import TiltingLaser
-from service.outputs import LookOut, OdomOut, Output, PolarOut, PoseOut, RangesOut, RectOut, ScanOut
+from service.outputs import (
+    UNKNOWN_VARIANCE,
+    LookOut,
+    OdomOut,
+    Output,
+    PolarOut,
+    PoseOut,
+    RangesOut,
+    RectOut,
+    ScanOut,
+)
 from service.sensors import AxleEncoder, Chain, Contacts, Laser, PoseSource, Ring, Sensor, Switch, Wheels
 
 if TYPE_CHECKING:
@@ -75,6 +85,7 @@ _SECTOR_GAP_NS = 20_000_000  # sonars that follow each other faster are publishe
 POSE_PERIOD_NS = 25_000_000  # a pose is told as soon as its odometry is so much newer than the last one's
 _HELD_MAX = 512  # scans and rounds that are held back for a localiser that is late; beyond, fusion waits for it
 _TOO_FAST_IN_A_ROW = 5  # then the counts are believed, and what lay between them is unknown
+_SPEED_VARIANCE_MIN = 1e-4  # (1 cm/s)^2 and (0.6 deg/s)^2: a count more or less
 _LOST_SCANS = 3  # in a row that fit nothing, where they alone tell the motion: then it is said
 _STALE_LIMIT_NS = 500_000_000
 _FARTHEST_POSE_M = 1e7
@@ -637,13 +648,16 @@ class Fusion:
         return self._take_state(state)
 
     def _take_state(self, state: OdometryState) -> list[Output]:
+        variances = _twist_variances(self._state, state)
         self._state = state
         if self._begun_ns is None:
             self._begun_ns = state.stamp_ns
         self._poses.add(state.stamp_ns, state.odom_from_base, after_break=state.broken)
         self._parts.localiser.take_odometry(state)
         outputs: list[Output] = [
-            OdomOut(state.stamp_ns, state.odom_from_base, state.covariance, state.forward_m_s, state.yaw_rad_s)
+            OdomOut(
+                state.stamp_ns, state.odom_from_base, state.covariance, state.forward_m_s, state.yaw_rad_s, *variances
+            )
         ]
         if self._pose_told_ns is None or state.stamp_ns - self._pose_told_ns >= POSE_PERIOD_NS:
             self._pose_told_ns = state.stamp_ns
@@ -1002,3 +1016,15 @@ def _fault_of_scan(reading: ScanReading, bearing: F64, distance: F64) -> str | N
     if not all(math.isfinite(limit) for limit in limits) or not 0.0 <= limits[0] < limits[1]:
         return "limits_wrong"
     return None
+
+
+def _twist_variances(before: OdometryState | None, now: OdometryState) -> tuple[float, float]:
+    """Of forward speed and yaw rate over the last step: by how much it made the pose less certain."""
+    seconds = 0.0 if before is None else (now.stamp_ns - before.stamp_ns) * 1e-9
+    if before is None or now.broken or seconds <= 0.0:
+        return UNKNOWN_VARIANCE, UNKNOWN_VARIANCE
+    grown = now.covariance - before.covariance
+    ahead = np.array([math.cos(before.odom_from_base.yaw_rad), math.sin(before.odom_from_base.yaw_rad)])
+    forward = max(0.0, float(ahead @ grown[:2, :2] @ ahead)) / seconds**2
+    turn = max(0.0, float(grown[2, 2])) / seconds**2
+    return forward + _SPEED_VARIANCE_MIN, turn + _SPEED_VARIANCE_MIN

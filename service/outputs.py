@@ -20,6 +20,10 @@ from mapping.sectors.snapshot import PolarSnapshot, RectSnapshot
 F64 = NDArray[np.float64]
 
 
+UNKNOWN_VARIANCE = 1e6
+"""Of a speed that nobody knows, in (m/s)^2 or (rad/s)^2: who fuses it takes nothing from it, as ROS drivers do it."""
+
+
 @dataclass(frozen=True, slots=True)
 class ScanOut:
     """A laser's sweep: key scan/<sensor>."""
@@ -62,13 +66,15 @@ class RectOut:
 
 @dataclass(frozen=True, slots=True)
 class OdomOut:
-    """Key odom: base in the odom frame. covariance: (3, 3) of x, y, yaw. twist: forward m/s, yaw rad/s."""
+    """Key odom: base in the odom frame. covariance: (3, 3) of x, y, yaw. Twist: forward m/s, yaw rad/s; variances."""
 
     stamp_ns: int
     odom_from_base: Pose2
     covariance: F64
     forward_m_s: float
     yaw_rad_s: float
+    forward_variance: float = UNKNOWN_VARIANCE
+    yaw_rate_variance: float = UNKNOWN_VARIANCE
 
 
 @dataclass(frozen=True, slots=True)

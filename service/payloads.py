@@ -53,7 +53,7 @@ UPDATE_CELLS_MAX = 32_000  # with the header below 32 KB
 GRID_ATTACHMENT = struct.Struct("<QQ")
 """Epoch of the full grid, number of the update within it (from 1; 0 on the full grid itself)."""
 
-_UNKNOWN_COVARIANCE = np.zeros((6, 6))
+_SIDEWAYS_VARIANCE = 1e-4  # wheels do not roll sideways; no number here is 0, which some filters take for certain
 _LEVELS = ("ok", "warning", "error", "stale")
 _STATES = {state.value: state.name.lower() for state in SectorState}
 _CAN_DRIVE = {Ground.TRAVERSABLE.value: "true", Ground.UNKNOWN.value: "null"}
@@ -423,6 +423,8 @@ def _laser_bytes(scan: Scan, frame: str, stamp_ns: int, scan_time_s: float, beam
 
 def _odometry_bytes(out: OdomOut, stamp_ns: int, frame: str, child: str) -> bytes:
     pose = out.odom_from_base
+    twist = np.zeros((6, 6))
+    twist[0, 0], twist[1, 1], twist[5, 5] = out.forward_variance, _SIDEWAYS_VARIANCE, out.yaw_rate_variance
     return cdr.encode_odometry(
         cdr.OdometryMessage(
             stamp_ns,
@@ -433,7 +435,7 @@ def _odometry_bytes(out: OdomOut, stamp_ns: int, frame: str, child: str) -> byte
             _planar_covariance(out.covariance),
             (out.forward_m_s, 0.0, 0.0),
             (0.0, 0.0, out.yaw_rad_s),
-            _UNKNOWN_COVARIANCE,
+            twist,
         )
     )
 

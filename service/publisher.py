@@ -123,9 +123,10 @@ class Outbox:
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """The last value of a key. grid: what is behind it, for other formats."""
+    """The last value of a key. measured_ns: monotonic.  grid: what is behind it, for other formats."""
 
     message: Message
+    measured_ns: int
     grid: GridOut | None = None
 
 
@@ -301,9 +302,10 @@ class Publisher:
         return closed and not any(thread.is_alive() for thread in self._threads)
 
     def _encode(self, output: Output) -> list[Message]:
-        messages = self._encoder.encode(output, self._clock.wall_from_monotonic_ns(0))
+        offset_ns = self._clock.wall_from_monotonic_ns(0)
+        messages = self._encoder.encode(output, offset_ns)
         if isinstance(output, GridOut):
-            self._last[messages[0].suffix] = _Kept(messages[0], output)
+            self._last[messages[0].suffix] = _Kept(messages[0], messages[0].stamp_ns - offset_ns, output)
         return messages
 
     def _send_loop(self, outbox: Outbox) -> None:
@@ -327,7 +329,8 @@ class Publisher:
     def _send(self, message: Message) -> None:
         kept = self._last.get(message.suffix)
         if kept is None or kept.message is not message:
-            self._last[message.suffix] = _Kept(message)
+            measured_ns = message.stamp_ns - self._clock.wall_from_monotonic_ns(0)
+            self._last[message.suffix] = _Kept(message, measured_ns)
         publisher, readers = self._publisher_of(message)
         if readers is None or readers.any:
             publisher.put(message.payload, encoding=message.encoding, attachment=message.attachment)
@@ -381,7 +384,7 @@ class Publisher:
         youngest_ns = self._youngest_allowed(query.parameters.get("max_age"))
         for suffix, kept in list(self._last.items()):
             key = f"{self.base}/{suffix}"
-            if not wanted.intersects(key) or kept.message.stamp_ns < youngest_ns:
+            if not wanted.intersects(key) or kept.measured_ns < youngest_ns:
                 continue
             if picture is None or kept.grid is None:
                 message = kept.message
@@ -398,14 +401,15 @@ class Publisher:
                 query.reply_err(text.encode(), encoding="text/plain")
 
     def _youngest_allowed(self, max_age: str | None) -> int:
-        """The oldest stamp to answer with, from `max_age` in seconds."""
+        """The oldest measurement to answer with, from `max_age` in seconds: by the monotonic clock, since one that was
+        set back would make old values young."""
         try:
             seconds = float(max_age) if max_age else None
         except ValueError:
             seconds = None
         if seconds is None or seconds < 0:
             return -(1 << 62)
-        return self._clock.wall_from_monotonic_ns(self._clock.now_ns()) - int(min(seconds, 1e9) * 1e9)
+        return self._clock.now_ns() - int(min(seconds, 1e9) * 1e9)
 
 
 def slot_of(output: Output) -> str:

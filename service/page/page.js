@@ -35,6 +35,7 @@ class Robot {
 
   addPose(pose) {
     this.pose = pose;
+    if (pose.stamp < (this.poses.at(-1)?.stamp ?? pose.stamp) - 0.5) this.poses = [];  // the robot's clock was set back
     this.poses.push(pose);
     if (this.poses.length > POSES_KEPT) this.poses.shift();
     const last = this.trail.at(-1);

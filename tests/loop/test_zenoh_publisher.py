@@ -19,7 +19,7 @@ from mapping.frames import Pose2
 from mapping.grids.patch import GridPatch
 from mapping.scan import Scan
 from service import cdr
-from service.clock import SystemClock
+from service.clock import CrankedClock, SystemClock
 from service.namesakes import BELIEVED_AFTER_NS
 from service.outputs import GridOut, GridUpdateOut, HealthOut, OdomOut, Output, PoseOut, ScanOut
 from service.payloads import RobotInfo
@@ -241,6 +241,21 @@ def test_max_age_leaves_out_what_is_older(publisher: Publisher, client: Client) 
     publisher.offer(scan_out(clock.now_ns(), "new"))
     wait_until(lambda: len(client.get(f"{BASE}/scan/*")) == 2)
     assert [answer.key for answer in client.get(f"{BASE}/scan/*?max_age=30")] == [f"{BASE}/scan/new"]
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_a_wall_clock_that_is_set_makes_no_value_young_or_old(endpoint: str, step_s: int) -> None:
+    """Ages went by the wall clock: set back by an hour it made a pose of a minute ago one that is not measured yet."""
+    clock = CrankedClock(1000 * SECOND, 1_700_000_000 * SECOND)
+    made = Publisher(BASE, NetworkSettings((endpoint,)), clock=clock)
+    made.start()
+    made.send(scan_out(clock.now_ns() - 60 * SECOND, "old"))
+    made.send(scan_out(clock.now_ns(), "new"))
+    clock.wall_offset_ns += step_s * SECOND
+    with PatientClient(endpoint) as client:
+        wait_until(lambda: len(client.get(f"{BASE}/scan/*")) == 2)
+        assert [answer.key for answer in client.get(f"{BASE}/scan/*?max_age=30")] == [f"{BASE}/scan/new"]
+    assert made.close(GIVE_UP_S)
 
 
 def test_updates_arrive_in_order_behind_their_grid(publisher: Publisher, client: Client) -> None:

@@ -718,6 +718,20 @@ def test_the_system_clocks_agree_with_the_system() -> None:
     assert before - 5_000_000 <= wall <= time.time_ns() + 5_000_000
 
 
+def test_one_moment_has_one_label_until_the_clock_is_really_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Labels came from a new reading each: messages of the same moment ran backwards by some hundred nanoseconds."""
+    wall_ahead = [100 * SECOND]
+    clocks = SimpleNamespace(monotonic_ns=lambda: 10 * SECOND, time_ns=lambda: 10 * SECOND + wall_ahead[-1])
+    monkeypatch.setattr("service.clock.time", clocks)
+    clock = SystemClock()
+    for jitter_ns in (0, 300, -300, 60_000, -60_000):
+        wall_ahead.append(100 * SECOND + jitter_ns)
+        assert clock.wall_from_monotonic_ns(7) == 100 * SECOND + 7
+    for step_ns in (3600 * SECOND, -3600 * SECOND, 150_000):
+        wall_ahead.append(wall_ahead[-1] + step_ns)
+        assert clock.wall_from_monotonic_ns(7) == wall_ahead[-1] + 7
+
+
 def test_a_label_is_right_although_the_clocks_were_not_read_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process was stopped for a second between two readings; the next ones are close together."""
     monotonic = iter((10 * SECOND, 11 * SECOND, 12 * SECOND, 12 * SECOND + 200))

@@ -24,7 +24,7 @@ from mapping.odometry import DriveGeometry
 from mapping.scan import Scan
 from mapping.sectors.snapshot import PolarSnapshot
 from service.fusion import Fusion, Parts, Round, Touch, carry, compose_many, stale_after_ns
-from service.outputs import OdomOut, Output, PolarOut, PoseOut, RangesOut, ScanOut
+from service.outputs import UNKNOWN_VARIANCE, OdomOut, Output, PolarOut, PoseOut, RangesOut, ScanOut
 from service.sensors import Chain, Laser, Transducer, Wheels
 
 MS = 1_000_000
@@ -386,6 +386,27 @@ def test_wheels_move_the_robot() -> None:
     assert isinstance(outputs[1], PoseOut)
     assert outputs[1].map_from_base.x_m == pytest.approx(0.1)
     assert outputs[1].map_from_odom == IDENTITY
+
+
+def test_how_fast_it_drives_is_told_with_how_surely() -> None:
+    """The variances were 0: a filter that fuses the speed would have believed it without any doubt."""
+    b = bench()
+
+    def told(at_ms: int, left: int, right: int, *, continuous: bool = True) -> tuple[float, float]:
+        reading = wheels(at_ms * MS, left, right, continuous=continuous)
+        out = b.fusion.on_item("drive", reading, at_ms * MS)[0]
+        assert isinstance(out, OdomOut)
+        return out.forward_variance, out.yaw_rate_variance
+
+    assert told(0, 0, 0) == (UNKNOWN_VARIANCE, UNKNOWN_VARIANCE), "no step yet"
+    per_m = GEOMETRY.travel_noise_m_per_sqrt_m**2
+    noise = per_m * (0.1 + 0.12)  # of both wheels' ways
+    at_least = 1e-4
+    forward, turn = noise / 4 / 0.1**2 + at_least, noise / 0.5**2 / 0.1**2 + at_least
+    assert told(100, 100, 120) == pytest.approx((forward, turn), rel=0.01)
+    assert told(200, 220, 220) == pytest.approx((forward, turn), rel=0.01)
+    assert told(300, 220, 220) == pytest.approx((1e-4, 1e-4)), "it stands, to a count"
+    assert told(400, 400, 400, continuous=False) == (UNKNOWN_VARIANCE, UNKNOWN_VARIANCE)
 
 
 def test_a_new_map_begins_where_the_robot_stands() -> None:

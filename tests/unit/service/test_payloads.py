@@ -241,7 +241,7 @@ def test_rect_document_goes_row_by_row() -> None:
 
 def test_odom_and_pose_come_with_their_transforms() -> None:
     covariance = np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]])
-    odom, tf = Encoder().encode(OdomOut(9, Pose2(1, 2, math.pi / 2), covariance, 0.5, -0.1), OFFSET)
+    odom, tf = Encoder().encode(OdomOut(9, Pose2(1, 2, math.pi / 2), covariance, 0.5, -0.1, 0.04, 0.09), OFFSET)
     message = cdr.decode_odometry(odom.payload)
     assert (message.frame, message.child_frame, message.position) == ("odom", "base_link", (1.0, 2.0, 0.0))
     assert message.orientation == pytest.approx((0, 0, math.sqrt(0.5), math.sqrt(0.5)))
@@ -249,6 +249,7 @@ def test_odom_and_pose_come_with_their_transforms() -> None:
     assert message.covariance[5, 1] == 5.0
     assert message.linear == (0.5, 0.0, 0.0)
     assert message.angular == (0.0, 0.0, -0.1)
+    assert [message.twist_covariance[index, index] for index in (0, 1, 5)] == [0.04, 1e-4, 0.09]
     (transform,) = cdr.decode_transforms(tf.payload)
     assert (transform.frame, transform.child_frame) == ("odom", "base_link")
 
