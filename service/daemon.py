@@ -158,7 +158,8 @@ class Daemon:
         store = self._open_store()
         maps = assemble.maps(config, self._sensors)
         start_pose = None if store is None or maps.building is None else restore(maps.building.grid, store)
-        if start_pose is not None and store is not None and maps.building is not None:
+        is_new = store is not None and not store.layers().get(GRID)
+        if start_pose is not None and store is not None and maps.building is not None and not is_new:
             self._tell_where_it_goes_on(store, maps.building.grid, start_pose)
         self._publisher = self._make_publisher()
         self._parts.callback(self._close_publisher)
@@ -172,6 +173,8 @@ class Daemon:
             )
         finally:
             starting()  # what hindered it is told before a minute of compiling has passed
+        if is_new and store is not None:
+            log.info("a new map begins: %s", store.path)
         makers = assemble_makers.map_makers(config, self._sensors)
         walls = assemble_makers.wall_maker(config, self._sensors, maps.building)
         makers += [] if walls is None else [walls]
@@ -265,9 +268,6 @@ class Daemon:
         return store
 
     def _tell_where_it_goes_on(self, store: MapStore, grid: OccupancyGrid, pose: Pose2) -> None:
-        if not store.layers().get(GRID):
-            log.info("a new map begins: %s", store.path)
-            return
         log.warning(
             "the map goes on where it was left (%s), with the robot at x %.2f m y %.2f m yaw %.0f deg: %s",
             told_of(store, grid, self._wall_ns()), pose.x_m, pose.y_m, math.degrees(pose.yaw_rad),
