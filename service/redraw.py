@@ -33,6 +33,7 @@ from mapping.localise.pose_graph import composed_poses
 from mapping.scan import Scan
 from service.background import Submit
 from service.fusion import FollowsCorrections, GridLayer, Round, Touch
+from service.kept_rounds import KeptRound, KeptTouch, Shapes
 from service.layers import BuildingLayer, insert_round, insert_sweep, insert_touch
 
 log = logging.getLogger(__name__)
@@ -48,28 +49,12 @@ STEP_RAD = math.radians(5.0)
 TOLERANCE_M = 0.015
 DELAY_NS = 500_000_000
 DELAY_NS_PER_KEPT = 2_000_000  # about ten times what one takes to draw thrice
-TOUCH_REACH_M = 3.0  # a switch sits on the robot
 GIVE_UP_AT_ONCE = 64  # so many may go before anything does: the rest is moved together each time
 _NO_CHANNELS: frozenset[int] = frozenset()
 RECENT = 40  # kept sweeps that make up what is around the robot
 
 
-@dataclass(frozen=True, slots=True)
-class KeptRound:
-    """A round of sonars, or a touch, kept like a sweep: see KeptSweep."""
-
-    sensor: str
-    key: int
-    in_key: F64
-    heard: Round | Touch
-
-    @property
-    def reach_m(self) -> float:
-        """The farthest that it says anything about."""
-        return self.heard.range_max_m if isinstance(self.heard, Round) else TOUCH_REACH_M
-
-
-Kept = KeptSweep | KeptRound
+Kept = KeptSweep | KeptRound | KeptTouch
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +150,7 @@ class Redrawer:
         self._reach: F64 = np.zeros(64)
         self._last: dict[tuple[str, frozenset[int]], Pose2] = {}
         self._bearings: dict[str, NDArray[np.float32]] = {}
+        self._shapes: Shapes = {}
         self._under_way: _UnderWay | None = None
         self._base: dict[Place, bytes] = {}
         self.on_redrawn: OnRedrawn = _ignore
@@ -188,7 +174,7 @@ class Redrawer:
         """The same for sonars."""
         if self._has_moved(source, map_from_base, frozenset(cone.channel for cone in heard.cones)):
             ends = _at_both_ends(map_from_base)
-            self._keep(KeptRound(source, key, _seen_from(key_pose, ends), heard), ends)
+            self._keep(KeptRound.of(source, key, _seen_from(key_pose, ends), heard, self._shapes), ends)
 
     def _has_moved(self, source: str, pose: Pose2, channels: frozenset[int]) -> bool:
         last = self._last.get((source, channels))
@@ -237,7 +223,7 @@ class Redrawer:
         """The same for a switch that is tripped."""
         if self._has_moved(source, map_from_base, frozenset([touch.switch.line])):
             ends = _at_both_ends(map_from_base)
-            self._keep(KeptRound(source, key, _seen_from(key_pose, ends), touch), ends)
+            self._keep(KeptTouch(source, key, _seen_from(key_pose, ends), touch), ends)
 
     def start_over(self, base: Iterable[tuple[int, int, bytes]] = ()) -> None:
         """Forget what was kept; base: tiles of the map that is there now."""
@@ -269,7 +255,7 @@ class Redrawer:
             if name in self._mounts and not np.array_equal(then, self._mounts[name])
         }
         for kept, ends, serial in zip(state.kept, state.drawn, state.serials.tolist()):
-            if isinstance(kept, KeptRound) or kept.sensor in self._mounts:
+            if not isinstance(kept, KeptSweep) or kept.sensor in self._mounts:
                 if isinstance(kept, KeptSweep) and kept.sensor in otherwise:
                     then_from_now = np.broadcast_to(otherwise[kept.sensor], (2, 3))
                     kept = replace(kept, in_key=composed_poses(kept.in_key, then_from_now))
@@ -365,7 +351,7 @@ class Redrawer:
                     continue
                 if isinstance(kept, KeptSweep):
                     layer.take_sweep(kept.sensor, kept.scan(), kept.poses(at, self._mounts[kept.sensor]))
-                elif isinstance(kept.heard, Round):
+                elif isinstance(kept, KeptRound):
                     layer.take_round(kept.sensor, kept.heard, Pose2(*at[0].tolist()))
                 else:
                     layer.take_touch(kept.sensor, kept.heard, Pose2(*at[0].tolist()))
@@ -393,7 +379,7 @@ def draw(grid: OccupancyGrid, kept: Kept, ends: F64, mounts: Mapping[str, F64]) 
     try:
         if isinstance(kept, KeptSweep):
             insert_sweep(grid, kept.scan(), kept.poses(ends, mounts[kept.sensor]))
-        elif isinstance(kept.heard, Round):
+        elif isinstance(kept, KeptRound):
             insert_round(grid, kept.sensor, kept.heard, Pose2(*ends[0].tolist()))
         else:
             insert_touch(grid, kept.heard, Pose2(*ends[0].tolist()))
@@ -431,8 +417,8 @@ def _name(kept: Kept) -> str:
     """What may stand for what: a laser's sweeps for each other, rounds of the same transducers."""
     if isinstance(kept, KeptSweep):
         return kept.sensor
-    if isinstance(kept.heard, Round):
-        return f"{kept.sensor}/{sorted(cone.channel for cone in kept.heard.cones)}"
+    if isinstance(kept, KeptRound):
+        return kept.shape.name
     return f"{kept.sensor}/{kept.heard.switch.line}"
 
 

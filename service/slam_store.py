@@ -16,19 +16,21 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import Pose2
+from mapping.kernels.localise_table import EMPTY
 from mapping.localise.closure_records import Closure
 from mapping.localise.kept_sweeps import KeptSweep
 from mapping.localise.slam_records import SlamState
-from mapping.localise.views import View, ViewStore, table_of
+from mapping.localise.views import PackedView, View, ViewStore, table_of
 from service.fusion import Cone, Round, Touch
-from service.redraw import Kept, KeptRound, RedrawState
+from service.kept_rounds import KeptRound, KeptTouch, Shapes
+from service.redraw import Kept, RedrawState
 from service.sensors import Switch
 
 F64 = NDArray[np.float64]
@@ -119,7 +121,7 @@ def _stored_of(rows: Mapping[int, Sequence[bytes]]) -> Stored:
     views = ViewStore()
     for tile in keys:
         for k in range(len(tile["stamps"])):
-            views.add(_view_of(tile, k))
+            views.add_packed(_packed_of(tile, k))
     joined = {name: np.concatenate([tile[name] for tile in keys])[:n] for name in ("stamps", "mounts")}
     between = {name: np.concatenate([tile[name] for tile in keys])[1:n] for name in ("path", "information")}
     if len(views) != n:
@@ -131,10 +133,11 @@ def _stored_of(rows: Mapping[int, Sequence[bytes]]) -> Stored:
         )
     )
     slam = SlamState(
-        views.arrays(), graph["poses"], graph["travel"], joined["mounts"], joined["stamps"], between["path"],
+        views.kept(), graph["poses"], graph["travel"], joined["mounts"], joined["stamps"], between["path"],
         between["information"], closures, graph["weight"], int(graph["epoch"]), int(graph["next_number"]),
     )  # fmt: skip
-    kept = [each for payload in rows[_KEPT] if payload for each in _kept_of(_unpack(payload))]
+    shapes: Shapes = {}
+    kept = [each for payload in rows[_KEPT] if payload for each in _kept_of(_unpack(payload), shapes)]
     if len(kept) != m:
         raise ValueError(f"{len(kept)} stored sweeps for {m} poses")
     base = {_PLACE.unpack_from(payload): payload[_PLACE.size :] for payload in rows[_BASE]}
@@ -159,29 +162,53 @@ def _mounts_of(graph: Mapping[str, Any], kept: Iterable[Kept], of_keys: F64) -> 
 def _key_tile(state: SlamState, number: int) -> bytes:
     """What was given up of the views stands there as nothing: no bins."""
     first, last = number * KEYS_A_TILE, min(state.views.count, (number + 1) * KEYS_A_TILE)
-    v, keys = state.views, slice(first, last)
-    there = v.is_there()[keys]
-    rows = v.rows(np.arange(first, last))
+    views = {k: _rounded(each) for k in range(last - first) if (each := state.views.packed(first + k)) is not None}
+    bins = max((view.table.bins for view in views.values()), default=0)
+    frames = np.zeros((last - first, 4))
+    points, normals = (np.zeros((2, last - first, bins), dtype=kind) for kind in (np.int32, np.int16))
+    quality = np.full((last - first, bins), EMPTY, dtype=np.float16)
+    for k, view in views.items():
+        width = view.table.bins
+        frames[k] = view.table.frame()
+        points[:, k, :width] = _millimetres(view.x), _millimetres(view.y)
+        normals[:, k, :width] = np.rint(np.stack((view.nx, view.ny)) * 32767.0)
+        quality[k, :width] = view.quality
+    keys = slice(first, last)
     path = np.concatenate((np.zeros((1, 3)), state.path))[keys]
     information = np.concatenate((np.zeros((1, 3, 3)), state.information))[keys]
     return _pack(
         stamps=state.stamps[keys],
         mounts=state.base_from_sensor[keys],
-        frames=np.where(there[:, None], v.frames[rows], 0.0),
-        points=np.rint(np.stack((v.x[rows], v.y[rows])) / _POINT_M * there[:, None]).astype(np.int32),
-        normals=np.rint(np.stack((v.nx[rows], v.ny[rows])) * 32767.0 * there[:, None]).astype(np.int16),
-        quality=v.quality[rows].astype(np.float16),
+        frames=frames,
+        points=points,
+        normals=normals,
+        quality=quality,
         path=path,
         information=information,
     )
 
 
-def _view_of(tile: Mapping[str, Any], k: int) -> View:
+def _rounded(packed: PackedView) -> View:
+    """A view as it comes back: its normals are those of the points that are kept."""
+    x, y = (_metres(_millimetres(each)) for each in (packed.x, packed.y))
+    return replace(packed, x=x, y=y).opened()
+
+
+def _packed_of(tile: Mapping[str, Any], k: int) -> PackedView | None:
+    """Its points; normals, which stand there for older programs, follow from them. None: it was given up."""
     table = table_of(tile["frames"][k])
-    x, y = (row[k, : table.bins].astype(np.float32) * np.float32(_POINT_M) for row in tile["points"])
-    nx, ny = (row[k, : table.bins].astype(np.float32) / np.float32(32767.0) for row in tile["normals"])
-    quality = tile["quality"][k, : table.bins].astype(np.float32)
-    return View(table, x, y, nx, ny, quality, int(np.sum(quality >= 0.0)), int(np.sum(quality > 0.0)))
+    if not table.bins:
+        return None
+    x, y = (_metres(row[k, : table.bins]) for row in tile["points"])
+    return PackedView(table, x, y, grazed=True)
+
+
+def _millimetres(points: NDArray[np.float32]) -> NDArray[np.int32]:
+    return np.asarray(np.rint(points / _POINT_M), dtype=np.int32)
+
+
+def _metres(millimetres: NDArray[np.int32]) -> NDArray[np.float32]:
+    return np.asarray(millimetres.astype(np.float32) * np.float32(_POINT_M))
 
 
 def _graph_tile(stored: Stored) -> bytes:
@@ -223,7 +250,7 @@ def _kept_tile(kept: Sequence[Kept]) -> bytes:
     about = {
         "order": [isinstance(each, KeptSweep) for each in kept],
         "sensors": [sweep.sensor for sweep in sweeps],
-        "rounds": [_round_document(each) for each in kept if isinstance(each, KeptRound)],
+        "rounds": [_round_document(each) for each in kept if not isinstance(each, KeptSweep)],
     }
     return _pack(
         about=np.frombuffer(json.dumps(about).encode(), dtype=np.uint8),
@@ -237,7 +264,7 @@ def _kept_tile(kept: Sequence[Kept]) -> bytes:
     )
 
 
-def _kept_of(tile: Mapping[str, Any]) -> list[Kept]:
+def _kept_of(tile: Mapping[str, Any], shapes: Shapes) -> list[Kept]:
     about = json.loads(tile["about"].tobytes())
     bearings = np.split(tile["bearing"], np.cumsum(tile["bearing_count"])[:-1])
     counts = tile["bearing_count"][tile["which"]]
@@ -249,10 +276,10 @@ def _kept_of(tile: Mapping[str, Any]) -> list[Kept]:
         )
     )
     rounds = iter(about["rounds"])
-    return [next(sweeps) if is_sweep else _round_of(next(rounds)) for is_sweep in about["order"]]
+    return [next(sweeps) if is_sweep else _round_of(next(rounds), shapes) for is_sweep in about["order"]]
 
 
-def _round_document(kept: KeptRound) -> list[Any]:
+def _round_document(kept: KeptRound | KeptTouch) -> list[Any]:
     heard = kept.heard
     if isinstance(heard, Touch):
         at, switch = heard.switch.base_from_contact, heard.switch
@@ -266,16 +293,15 @@ def _round_document(kept: KeptRound) -> list[Any]:
     return [kept.sensor, kept.key, kept.in_key.tolist(), heard.stamp_ns, *limits, cones]
 
 
-def _round_of(document: list[Any]) -> KeptRound:
+def _round_of(document: list[Any], shapes: Shapes) -> KeptRound | KeptTouch:
     if len(document) == 6:
         sensor, key, in_key, stamp_ns, tripped, (line, x, y, yaw, width_m) = document
         touch = Touch(int(stamp_ns), Switch(int(line), Pose2(x, y, yaw), width_m), tripped)
-        return KeptRound(sensor, int(key), np.array(in_key), touch)
+        return KeptTouch(sensor, int(key), np.array(in_key), touch)
     sensor, key, in_key, stamp_ns, cone_rad, range_min_m, range_max_m, cones = document
     heard = tuple(Cone(int(channel), Pose2(x, y, yaw), range_m) for channel, x, y, yaw, range_m in cones)
-    return KeptRound(
-        sensor, int(key), np.array(in_key), Round(int(stamp_ns), heard, cone_rad, range_min_m, range_max_m)
-    )
+    told = Round(int(stamp_ns), heard, cone_rad, range_min_m, range_max_m)
+    return KeptRound.of(sensor, int(key), np.array(in_key), told, shapes)
 
 
 def _pack(**arrays: NDArray[Any]) -> bytes:

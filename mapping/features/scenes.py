@@ -32,7 +32,7 @@ from mapping.frames import Pose2, wrap_angle, wrap_angles
 from mapping.kernels import features as kernels
 from mapping.kernels.localise_table import EMPTY
 from mapping.localise.scan_match import agreement, match_view
-from mapping.localise.views import BearingTable, View, ViewArrays, ViewStore, fill_normals, table_for, view_of
+from mapping.localise.views import BearingTable, KeptViews, View, ViewStore, alone, fill_normals, table_for, view_of
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -236,7 +236,7 @@ class SceneDatabase:
         self.rules = rules or RecogniseRules()
         self.most = most
         self._graphs: list[AnchorGraph] = []
-        self._views = ViewStore()
+        self._views = ViewStore(open_most=most)  # any of them may be looked at next
         self._poses: F64 = np.empty((0, 3))
         self._vectors: F64 = np.empty((0, len(SCENE_FEATURES)))
         self._indexes: list[DistanceIndex] = []
@@ -323,12 +323,12 @@ class SceneDatabase:
         """By the places that a graph proposes."""
         if len(graph) < 2:
             return Answer(None, (), f"too few anchor points: {len(graph)}")
-        arrays = self._views.arrays()
+        views = self._views.kept()
         proposed = self._places(graph, count)
-        places = [(self._glance(sight, arrays, scene, at), scene, n, at) for scene, n, at in proposed]
+        places = [(self._glance(sight, views, scene, at), scene, n, at) for scene, n, at in proposed]
         places.sort(key=lambda place: -place[0])
         good = [place for place in places[: self.rules.most_matched] if place[0] > places[0][0] - _GLANCE_MARGIN]
-        found = [self._prove(sight, arrays, count, *place[1:]) for place in good]
+        found = [self._prove(sight, views, count, *place[1:]) for place in good]
         candidates = tuple(sorted((each for each in found if each is not None), key=lambda each: -each.score))
         return self._verdict(candidates)
 
@@ -362,38 +362,36 @@ class SceneDatabase:
                     break
         return places
 
-    def _glance(self, sight: Sight, arrays: ViewArrays, scene: int, at: Pose2) -> float:
+    def _glance(self, sight: Sight, views: KeptViews, scene: int, at: Pose2) -> float:
         """How the sight fits the scene that proposed a place, before it is laid on it."""
         rows = np.array([scene])
-        seen = agreement(sight.view, arrays, rows, self._poses[rows], at, near_m=0.3)
+        seen = agreement(sight.view, views, rows, self._poses[rows], at, near_m=0.3)
         return seen.explained - seen.refuted
 
     def _prove(
-        self, sight: Sight, arrays: ViewArrays, count: int, scene: int, partners: int, at: Pose2
+        self, sight: Sight, views: KeptViews, count: int, scene: int, partners: int, at: Pose2
     ) -> Candidate | None:
         """Lay the sight on those of the first `count` scenes that are around a place, and see how it fits."""
         rows = self._around(at, count, _REFERENCES)
-        match = match_view(sight.view, arrays, rows, self._poses[rows], at)
+        match = match_view(sight.view, views, rows, self._poses[rows], at)
         if match is None:
             return None
         rows = self._around(match.pose, count, 2 * _REFERENCES)
         if not len(rows):
             return None
-        seen = agreement(sight.view, arrays, rows, self._poses[rows], match.pose)
-        back = self._seen_back(sight, arrays, rows[:_REFERENCES], match.pose)
+        seen = agreement(sight.view, views, rows, self._poses[rows], match.pose)
+        back = self._seen_back(sight, views, rows[:_REFERENCES], match.pose)
         score = seen.explained - seen.refuted - back
         return Candidate(match.pose, scene, partners, score, seen.explained, seen.refuted)
 
-    def _seen_back(self, sight: Sight, arrays: ViewArrays, rows: I64, at: Pose2) -> float:
+    def _seen_back(self, sight: Sight, views: KeptViews, rows: I64, at: Pose2) -> float:
         """Share of what the nearest scenes saw that the sight would have seen through, were it from there."""
         view = sight.view
-        own = ViewArrays(
-            1, view.x[None], view.y[None], view.nx[None], view.ny[None], view.quality[None], view.table.frame()[None]
-        )
+        own = alone(view)
         pose = np.array([[at.x_m, at.y_m, at.yaw_rad]])
         total = 0.0
         for row in rows:
-            seen = agreement(arrays.view(int(row)), own, np.array([0]), pose, self.pose(int(row)))
+            seen = agreement(views.view(int(row)), own, np.array([0]), pose, self.pose(int(row)))
             total += seen.refuted
         return total / max(1, len(rows))
 
@@ -423,7 +421,7 @@ class SceneDatabase:
 
     def scene_bytes(self, scene: int) -> bytes:
         """A scene to be kept: pose, points, anchors; 8 bytes a beam and 28 an anchor, deflated."""
-        graph, view = self._graphs[scene], self._views.arrays().view(scene)
+        graph, view = self._graphs[scene], self._views.kept().view(scene)
         head = _HEAD.pack(_MAGIC, view.table.bins, len(graph), *self._poses[scene], *view.table.frame())
         filled = view.quality > EMPTY
         body = (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.localise.pose_graph import Edges
-from mapping.localise.views import ViewArrays
+from mapping.localise.views import KeptViews
 
 F64 = NDArray[np.float64]
 
@@ -116,7 +116,7 @@ class Snapshot:
     in any case, until nothing moves.
     """
 
-    views: ViewArrays
+    views: KeptViews
     poses: F64
     travel_m: F64
     path: Edges

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapping.frames import Pose2
 from mapping.localise.closures import REFINING
 from mapping.localise.scan_match import Match, agreement, match_view, weakest_information
-from mapping.localise.views import View, ViewArrays
+from mapping.localise.views import KeptViews, View
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -32,7 +32,7 @@ def nearest_keys(poses: F64, near: Pose2, within_m: float, most: int, there: Boo
     return close if len(close) else order[:1]
 
 
-def fitting_match(view: View, store: ViewArrays, rows: I64, poses: F64, guess: Pose2) -> Match | None:
+def fitting_match(view: View, store: KeptViews, rows: I64, poses: F64, guess: Pose2) -> Match | None:
     """The view laid on key scans from a rough guess; None unless it fits well enough to say where it was taken."""
     match = match_view(view, store, rows, poses, guess, reach=REFINING)
     if match is None or weakest_information(match.information()) < HELD_PER_M2:

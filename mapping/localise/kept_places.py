@@ -36,47 +36,59 @@ class _Entry:
     profile: F32 | None
 
 
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """What is kept of one cell, the oldest first."""
+
+    cell: Cell
+    entries: list[_Entry]
+
+
 class KeptPlaces:
     """What is kept, by place: at most so much of each. Serials rise with time."""
 
     def __init__(self, most: int = MOST) -> None:
         self._most = most
-        self._cells: dict[Cell, list[_Entry]] = {}
-        self._cell_of: dict[int, Cell] = {}
+        self._places: dict[Cell, _Place] = {}
+        self._place_of: dict[int, _Place] = {}
 
     def __len__(self) -> int:
-        return len(self._cell_of)
+        return len(self._place_of)
 
     def add(self, serial: int, name: str, pose: F64, profile: F32 | None) -> list[int]:
         """Something of that name (a sensor's) was kept, seen from pose (3,). Returns the serials that may be given up
         for it, which are forgotten here."""
-        cell = _cell(name, pose)
-        entries = self._cells.setdefault(cell, [])
+        place = self._at(_cell(name, pose))
+        entries = place.entries
         entries.append(_Entry(serial, profile))
-        self._cell_of[serial] = cell
+        self._place_of[serial] = place
         gone = []
         while len(entries) > self._most:
             entry = entries.pop(_least_needed(entries))
-            del self._cell_of[entry.serial]
+            del self._place_of[entry.serial]
             gone.append(entry.serial)
         return gone
 
     def move(self, serials: Iterable[int], poses: F64) -> None:
         """What is kept is seen from elsewhere now: poses (K, 3) of serials (K)."""
         for serial, pose in zip(serials, poses):
-            before = self._cell_of.get(serial)
+            before = self._place_of.get(serial)
             if before is None:
                 continue
-            after = _cell(before[0], pose)
-            if after != before:
-                entries = self._cells[before]
-                index = next(k for k, entry in enumerate(entries) if entry.serial == serial)
-                there = self._cells.setdefault(after, [])
-                there.append(entries.pop(index))
-                there.sort(key=lambda entry: entry.serial)
-                self._cell_of[serial] = after
-                if not entries:
-                    del self._cells[before]
+            cell = _cell(before.cell[0], pose)
+            if cell != before.cell:
+                index = next(k for k, entry in enumerate(before.entries) if entry.serial == serial)
+                after = self._place_of[serial] = self._at(cell)
+                after.entries.append(before.entries.pop(index))
+                after.entries.sort(key=lambda entry: entry.serial)
+                if not before.entries:
+                    del self._places[before.cell]
+
+    def _at(self, cell: Cell) -> _Place:
+        place = self._places.get(cell)
+        if place is None:
+            place = self._places[cell] = _Place(cell, [])
+        return place
 
 
 def profile_of(bearing_rad: F64, range_m: F64, yaw_rad: float) -> F32:

@@ -140,7 +140,7 @@ class LaserOdometry:
             if math.hypot(pose.x_m - near.x_m, pose.y_m - near.y_m) < self._settings.near_m
         ] or self._keys[-1:]
         rows = np.array([number for number, _ in close], dtype=np.int64)
-        return References(self._views.arrays(), rows, np.array([_row(pose) for _, pose in close]))
+        return References(self._views.kept(), rows, np.array([_row(pose) for _, pose in close]))
 
     def _told(self, view: View, match: Match, middle_ns: int, base_from_sensor: Pose2, moved: F64) -> OdometryState:
         """The state at a sweep that was laid on others; the sweep is kept if it saw new ground."""

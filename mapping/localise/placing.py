@@ -17,7 +17,7 @@ from mapping.frames import Pose2
 from mapping.localise.fitting import fitting_match, nearest_keys
 from mapping.localise.scan_match import agreement
 from mapping.localise.search import find_view, raster_of
-from mapping.localise.views import View, ViewArrays, table_for, view_of
+from mapping.localise.views import KeptViews, View, table_for, view_of
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -55,7 +55,7 @@ class Placing:
     least: quality below which a place is none; new ground looks a little like much that is known.
     """
 
-    views: ViewArrays
+    views: KeptViews
     poses: F64
     scan: Scan
     among: tuple[Pose2, ...] = ()

@@ -168,7 +168,7 @@ def _match(view: View, on: View, guess: Pose2) -> Match | None:
         return None
     store = ViewStore()
     store.add(on)
-    match = match_view(view, store.arrays(), FIRST_ROW, FIRST_FRAME, guess, same_partners=0.0)
+    match = match_view(view, store.kept(), FIRST_ROW, FIRST_FRAME, guess, same_partners=0.0)
     return match if match is not None and match.score >= LEAST_SCORE else None
 
 

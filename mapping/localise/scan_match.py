@@ -26,7 +26,7 @@ from mapping.kernels.localise_match import (
     align,
     compare,
 )
-from mapping.localise.views import View, ViewArrays
+from mapping.localise.views import KeptViews, View
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -107,7 +107,7 @@ class Agreement:
 
 def match_view(
     view: View,
-    store: ViewArrays,
+    store: KeptViews,
     rows: I64,
     poses: F64,
     guess: Pose2,
@@ -125,9 +125,10 @@ def match_view(
     result = np.zeros(RESULT_LENGTH)
     at = np.array([guess.x_m, guess.y_m, guess.yaw_rad])
     weight = prior * (POINT_SIGMA_M**2 * max(1, len(rows)))
+    on = store.opened(rows)
     align(
         view.x, view.y, view.nx, view.ny, view.quality,
-        store.x, store.y, store.nx, store.ny, store.quality, store.frames, store.rows(rows), poses,
+        on.x, on.y, on.nx, on.ny, on.quality, on.frames, on.rows, poses,
         at, weight, np.asarray(reach.reach_m), np.asarray(reach.scale_m), MOST_STEPS, same_partners, result,
     )  # fmt: skip
     if result[RESULT_STEPS] <= 0.0 or result[RESULT_COUNT] < 3.0 or not np.all(np.isfinite(result)):
@@ -146,13 +147,14 @@ def match_view(
 
 
 def agreement(
-    view: View, store: ViewArrays, rows: I64, poses: F64, pose: Pose2, *, near_m: float = NEAR_M
+    view: View, store: KeptViews, rows: I64, poses: F64, pose: Pose2, *, near_m: float = NEAR_M
 ) -> Agreement:
     """How a view at a pose fits what the references saw: the free space they saw counts as much as their walls."""
     votes = np.zeros(3)
     at = np.array([pose.x_m, pose.y_m, pose.yaw_rad])
+    on = store.opened(rows)
     compare(
-        view.x, view.y, view.quality, store.x, store.y, store.quality, store.frames, store.rows(rows), poses,
+        view.x, view.y, view.quality, on.x, on.y, on.quality, on.frames, on.rows, poses,
         at, near_m, votes,
     )  # fmt: skip
     n = max(1.0, float(votes.sum()))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2, wrap_angle
 from mapping.kernels.localise_search import draw_points, pool, search
-from mapping.localise.views import View, ViewArrays
+from mapping.localise.views import KeptViews, View
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -53,7 +53,7 @@ class Found:
     rival: float
 
 
-def raster_of(store: ViewArrays, rows: I64, poses: F64, *, window_m: float = 0.0) -> Raster:
+def raster_of(store: KeptViews, rows: I64, poses: F64, *, window_m: float = 0.0) -> Raster:
     """Draw views `rows` (R,) at poses (R, 3), to be searched within window_m."""
     is_wide = window_m > WIDE_M
     block = WIDE_BLOCK if is_wide else BLOCK
@@ -61,7 +61,8 @@ def raster_of(store: ViewArrays, rows: I64, poses: F64, *, window_m: float = 0.0
     x0, y0 = (float(v) - margin for v in poses[:, :2].min(axis=0))
     x1, y1 = (float(v) + FARTHEST_M for v in poses[:, :2].max(axis=0))
     fine = np.zeros((math.ceil((y1 - y0) / RESOLUTION_M) + 1, math.ceil((x1 - x0) / RESOLUTION_M) + 1), dtype=np.uint8)
-    draw_points(store.x, store.y, store.quality, store.rows(rows), poses, x0, y0, RESOLUTION_M, fine)
+    on = store.opened(rows)
+    draw_points(on.x, on.y, on.quality, on.rows, poses, x0, y0, RESOLUTION_M, fine)
     pooled = pool(fine, block, 1)
     if not is_wide:
         return Raster(fine, pooled, block, pooled, block, x0, y0)

@@ -116,7 +116,7 @@ class Slam:
         edges = self._path.edges()
         mounts = np.array([_row(each) for each in self._base_from_sensor]).reshape(-1, 3)
         return SlamState(
-            self._views.arrays(), self._poses[:n].copy(), self._travel[:n].copy(), mounts,
+            self._views.kept(), self._poses[:n].copy(), self._travel[:n].copy(), mounts,
             np.array(self._key_stamps, dtype=np.int64), edges.measured, edges.information, self.closures,
             self.closure_weight.copy(), self.epoch, self._next_number,
         )  # fmt: skip
@@ -130,7 +130,7 @@ class Slam:
         if len(self._views) or self._tracker.last is not None:
             raise RuntimeError("a map is taken up before the first scan")
         for row in range(n):
-            self._views.add(state.views.view(row))
+            self._views.add_packed(state.views.packed(row))
         room = max(64, n)
         self._poses, self._travel = np.zeros((room, 3)), np.zeros(room)
         self._poses[:n], self._travel[:n] = state.poses, state.travel_m
@@ -138,7 +138,7 @@ class Slam:
         mounts = (Pose2(*row) for row in state.base_from_sensor.tolist())
         self._base_from_sensor = [shared.setdefault(mount, mount) for mount in mounts]
         self._key_stamps = state.stamps.tolist()
-        for row in np.flatnonzero(self._views.arrays().is_there()).tolist():
+        for row in np.flatnonzero(self._views.kept().is_there()).tolist():
             self._may_go.update(self._places.add(row, "", state.poses[row], None))
         self._path = KeyPath(state.path, state.information)
         self.closures, self.closure_weight = state.closures, state.weight.copy()
@@ -161,9 +161,9 @@ class Slam:
         guess = map_from_base @ base_from_sensor
         rows = nearest_keys(
             self._poses[: len(self._views)], guess, self.settings.near_m, self.settings.references,
-            self._views.arrays().is_there(),
+            self._views.kept().is_there(),
         )  # fmt: skip
-        match = fitting_match(view, self._views.arrays(), rows, self._poses[rows], guess)
+        match = fitting_match(view, self._views.kept(), rows, self._poses[rows], guess)
         if match is None:
             return None
         nearest = int(rows[0])
@@ -217,7 +217,7 @@ class Slam:
         distance = np.hypot(self._poses[rows, 0] - near.x_m, self._poses[rows, 1] - near.y_m)
         close = rows[distance < self.settings.near_m]
         chosen = close if len(close) else rows[-1:]
-        return References(self._views.arrays(), chosen, self._poses[chosen])
+        return References(self._views.kept(), chosen, self._poses[chosen])
 
     def _is_new_ground(self, sensor: str, pose: Pose2, *, patience: float) -> bool:
         """Whether the sensor has moved enough since its last key scan for another one."""
@@ -383,7 +383,7 @@ class Slam:
     def _snapshot(self, keys: tuple[int, ...], *, thorough: bool = False) -> Snapshot:
         n = len(self._views)
         return Snapshot(
-            self._views.arrays(), self._poses[:n].copy(), self._travel[:n].copy(), self._path.edges(), self.closures,
+            self._views.kept(), self._poses[:n].copy(), self._travel[:n].copy(), self._path.edges(), self.closures,
             self._pending, keys, self._unoptimised, self._next_number, thorough,
         )  # fmt: skip
 
@@ -413,7 +413,7 @@ class Slam:
     def _look_again(self, done: int, total: int, progress: Progress | None) -> None:
         """Look for closures of the key scans that have none, then let the graph settle: a loop that was closed
         late brings others within reach."""
-        n, there = len(self._views), self._views.arrays().is_there()
+        n, there = len(self._views), self._views.kept().is_there()
         for first in range(0, n, 40):
             closed = {c.to for c in self.closures}
             keys = tuple(k for k in range(first, min(n, first + 40)) if k not in closed and there[k])

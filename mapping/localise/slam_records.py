@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.localise.closure_records import Closure, ClosureSettings
-from mapping.localise.views import ViewArrays
+from mapping.localise.views import KeptViews
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -76,7 +76,7 @@ class SlamState:
     from one key scan to the next.  weight: (C,) of closures.
     """
 
-    views: ViewArrays
+    views: KeptViews
     poses: F64
     travel_m: F64
     base_from_sensor: F64

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapping.frames import Pose2
 from mapping.localise.scan_match import POINT_SIGMA_M, Match, Reach, agreement, match_view
-from mapping.localise.views import View, ViewArrays
+from mapping.localise.views import KeptViews, View
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -28,7 +28,7 @@ SIGMA_M = 0.03  # what a peak is off
 SETTLING = Reach((0.15, 0.15, 0.15, 0.15), (0.06, 0.05, 0.04, POINT_SIGMA_M))
 
 
-def slid(view: View, store: ViewArrays, rows: I64, poses: F64, match: Match, *, prominence: float) -> Match | None:
+def slid(view: View, store: KeptViews, rows: I64, poses: F64, match: Match, *, prominence: float) -> Match | None:
     """The match of a view with the store's views `rows` (R,) at poses (R, 3), moved along the direction that is held
     worst to where most of its points are explained, and held there to SIGMA_M.
 

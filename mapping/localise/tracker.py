@@ -27,7 +27,7 @@ from mapping.localise.scan_match import (
 )
 from mapping.localise.search import find_view, raster_of
 from mapping.localise.slam_records import SlamSettings
-from mapping.localise.views import BearingTable, View, ViewArrays, table_for, view_of
+from mapping.localise.views import BearingTable, KeptViews, View, table_for, view_of
 from mapping.scan import Scan
 
 F64 = NDArray[np.float64]
@@ -72,7 +72,7 @@ class Place:
 class References:
     """Key scans that a view is laid on: numbers (R,) in a store of views, map_from_sensor (R, 3)."""
 
-    store: ViewArrays
+    store: KeptViews
     rows: I64
     poses: F64
 

@@ -15,18 +15,8 @@ from mapping.sectors.sight import Sight, Star, arc_of_cone, end_points, median_s
 
 F64 = NDArray[np.float64]
 
-_BYTES_REMEMBERED = 4 << 20
 _TOUCH_STEP_M = 0.02
 _SCANS_REMEMBERED = 40  # four seconds of a slow scanner
-
-
-def cones_remembered(sectors: int) -> int:
-    """How many of its findings about cones a map of so many sectors keeps.
-
-    Sonars stand still on the robot and mostly tell whole centimetres, so the same distances come again and again; what
-    each says of the sectors is worked out once. 16 sonars of 3 m have 4800 of them: 4 MB for a polar map.
-    """
-    return max(256, _BYTES_REMEMBERED // (33 * sectors + 500))  # four doubles and a truth a sector, and their heads
 
 
 class SpacingMemory:

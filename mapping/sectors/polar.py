@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,11 +14,11 @@ from mapping.sectors.evidence import Evidence, Finding, blind_finding
 from mapping.sectors.footprint import Outline, checked_polygon
 from mapping.sectors.inputs import (
     FanReader,
-    cones_remembered,
     echo_and_free,
     is_nothing,
     touched_line,
 )
+from mapping.sectors.remembered import RememberedCones
 from mapping.sectors.sight import LEAST_RANGE_M, Sight, arc_directions, arc_of_cone, cone_pieces
 from mapping.sectors.snapshot import PolarSnapshot, SectorState
 
@@ -83,7 +82,7 @@ class PolarSectors:
         own = checked_polygon(footprint) if footprint is not None and self_filter else None
         self._fans = FanReader(own) if fans is None else fans
         self._frame = _Wedges(self.edges_rad, sector_rad, range_max_m, self._outline)
-        self._heard = lru_cache(cones_remembered(len(self.edges_rad) - 1))(self._find_in_cone)
+        self._heard = RememberedCones(len(self.edges_rad) - 1, self._find_in_cone)
         self._evidence = Evidence(
             count=len(self.edges_rad) - 1,
             sources=tuple(sources),

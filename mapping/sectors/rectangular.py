@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,11 +15,11 @@ from mapping.sectors.evidence import Evidence, Finding, Later, Verdict, blind_fi
 from mapping.sectors.footprint import Outline, checked_polygon
 from mapping.sectors.inputs import (
     FanReader,
-    cones_remembered,
     is_nothing,
     see_cone,
     touched_line,
 )
+from mapping.sectors.remembered import RememberedCones
 from mapping.sectors.sight import Sight, arc_of_cone
 from mapping.sectors.snapshot import RectSnapshot, Squares
 
@@ -67,7 +67,7 @@ class RectSectors:
         if self._shape[0] * self._shape[1] > _SECTORS_MAX:
             raise ValueError(f"{self._shape[0]} x {self._shape[1]} sectors are too many: enlarge sector_m")
         self._raster = _Raster(self.x_edges_m, self.y_edges_m, sector_m, Outline(footprint, base_from_sensor))
-        self._heard = lru_cache(cones_remembered(self._shape[0] * self._shape[1]))(self._find_in_cone)
+        self._heard = RememberedCones(self._shape[0] * self._shape[1], self._find_in_cone)
         self._evidence = Evidence(
             count=self._shape[0] * self._shape[1],
             sources=tuple(sources),
@@ -126,8 +126,11 @@ class RectSectors:
         pose = self._virtual_from_base @ base_from_transducer
         return blind_finding(self._raster.covered_by_cone(cone_rad, range_max_m, pose))
 
-    def _find_heard(self, base_from_transducer: Pose2, *heard: float) -> Finding:
-        return self._heard(self._virtual_from_base @ base_from_transducer, *heard)
+    def _find_heard(
+        self, base_from_transducer: Pose2, cone_rad: float, range_m: float, range_min_m: float, range_max_m: float
+    ) -> Finding:
+        pose = self._virtual_from_base @ base_from_transducer
+        return self._heard(pose, cone_rad, range_m, range_min_m, range_max_m)
 
     def _find_in_cone(
         self, pose: Pose2, cone_rad: float, range_m: float, range_min_m: float, range_max_m: float

@@ -29,7 +29,7 @@ def work(votes: int, worth: float, step_m: float = STEP_M) -> tuple[Work, list[C
     poses: NDArray[np.float64] = np.zeros((2 * AGAIN, 3))
     poses[:, 0] = keys % AGAIN * step_m
     path = Edges.none()
-    shot = Snapshot(ViewStore().arrays(), poses, keys * step_m, path, (), (), (), 0, 0)
+    shot = Snapshot(ViewStore().kept(), poses, keys * step_m, path, (), (), (), 0, 0)
     pending = [Closure(k, AGAIN + k, Pose2(0.0, 5.0), np.eye(3), worth, True) for k in range(votes)]
     return Work(shot, ClosureSettings()), pending
 
@@ -78,7 +78,7 @@ def test_what_the_way_cannot_explain_surprises() -> None:
     n = len(steps)
     sure = np.repeat(np.diag([0.01**-2.0, 0.01**-2.0, math.radians(0.2) ** -2.0])[None], n, axis=0)
     path = Edges(np.arange(n), np.arange(1, n + 1), steps, sure, np.zeros(n, dtype=np.bool_))
-    shot = Snapshot(ViewStore().arrays(), rows, 0.5 * np.arange(n + 1.0), path, (), (), (), 0, 0)
+    shot = Snapshot(ViewStore().kept(), rows, 0.5 * np.arange(n + 1.0), path, (), (), (), 0, 0)
     judge = Work(shot, ClosureSettings())
     seen = np.diag([0.02**-2.0, 0.02**-2.0, math.radians(0.3) ** -2.0])
     assert judge._surprise(Closure(0, n, Pose2(0.5, -0.6, 0.02), seen, 1.0, True)) < ClosureSettings().expected
@@ -140,7 +140,7 @@ def test_a_street_driven_the_other_way_is_laid_on_the_keys_that_saw_its_houses()
     for k in keys:
         store.add(seen_from(0.5 * k, 0.0))
     poses = np.stack((0.5 * keys, 0.0 * keys, 0.0 * keys), axis=-1)
-    shot = Snapshot(store.arrays(), np.vstack((poses, [[20.0, 0.0, math.pi]])), np.append(0.5 * keys, 100.0),
+    shot = Snapshot(store.kept(), np.vstack((poses, [[20.0, 0.0, math.pi]])), np.append(0.5 * keys, 100.0),
                     Edges.none(), (), (), (), 0, 0)  # fmt: skip
     judge, pose = Work(shot, ClosureSettings()), Pose2(14.0, 0.0, math.pi)
     chosen = judge._seeing(seen_from(14.0, math.pi), 40, keys, pose)

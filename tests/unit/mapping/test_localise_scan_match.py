@@ -57,7 +57,7 @@ def test_the_pose_comes_back_from_a_wrong_guess(off: Pose2) -> None:
     poses = [Pose2(0.0, 0.0, 0.2), Pose2(0.4, 0.1, 0.4), Pose2(0.8, 0.1, 0.1)]
     store = store_of(ROOM, poses)
     truth = Pose2(0.6, 0.3, 0.5)
-    match = match_view(seen(ROOM, truth), store.arrays(), np.arange(3), rows_of(poses), truth @ off)
+    match = match_view(seen(ROOM, truth), store.kept(), np.arange(3), rows_of(poses), truth @ off)
     assert match is not None
     left = truth.inverse() @ match.pose
     assert math.hypot(left.x_m, left.y_m) < 2e-3
@@ -72,7 +72,7 @@ def test_a_crowd_in_front_of_half_the_walls_does_no_harm() -> None:
     people: list[Wall] = [((0.9 * c - 0.1, 0.9 * s), (0.9 * c + 0.1, 0.9 * s + 0.1)) for c, s in
                           ((math.cos(k), math.sin(k)) for k in range(6))]  # fmt: skip
     truth = Pose2(0.2, 0.1, 0.05)
-    match = match_view(seen(ROOM + people, truth), store.arrays(), np.arange(2), rows_of(poses), Pose2(0.3, 0.0, 0.1))
+    match = match_view(seen(ROOM + people, truth), store.kept(), np.arange(2), rows_of(poses), Pose2(0.3, 0.0, 0.1))
     assert match is not None
     left = truth.inverse() @ match.pose
     assert math.hypot(left.x_m, left.y_m) < 0.02
@@ -83,12 +83,12 @@ def test_a_corridor_holds_nothing_along_itself_and_the_prior_does() -> None:
     poses = [Pose2(0.0, 0.0, 0.0)]
     store = store_of(CORRIDOR, poses)
     view = seen(CORRIDOR, Pose2(0.5, 0.2, 0.0))
-    free = match_view(view, store.arrays(), np.arange(1), rows_of(poses), Pose2(0.4, 0.1, 0.02))
+    free = match_view(view, store.kept(), np.arange(1), rows_of(poses), Pose2(0.4, 0.1, 0.02))
     assert free is not None
     assert weakest_information(free.information()) < 100.0
     assert free.pose.y_m == pytest.approx(0.2, abs=2e-3)
     held = match_view(
-        view, store.arrays(), np.arange(1), rows_of(poses), Pose2(0.4, 0.1, 0.02), prior=np.diag([1e4, 1.0, 1.0])
+        view, store.kept(), np.arange(1), rows_of(poses), Pose2(0.4, 0.1, 0.02), prior=np.diag([1e4, 1.0, 1.0])
     )
     assert held is not None
     assert held.pose.x_m == pytest.approx(0.4, abs=2e-3)
@@ -103,7 +103,7 @@ def test_the_promised_variance_is_the_variance() -> None:
         store.add(seen(ROOM, Pose2(), noise_m=0.02, seed=2 * k))
         truth = Pose2(0.1, 0.05, 0.03)
         match = match_view(
-            seen(ROOM, truth, noise_m=0.02, seed=2 * k + 1), store.arrays(), np.arange(1), np.zeros((1, 3)), truth
+            seen(ROOM, truth, noise_m=0.02, seed=2 * k + 1), store.kept(), np.arange(1), np.zeros((1, 3)), truth
         )
         assert match is not None
         off = np.array([match.pose.x_m - truth.x_m, match.pose.y_m - truth.y_m, match.pose.yaw_rad - truth.yaw_rad])
@@ -115,9 +115,9 @@ def test_nothing_to_hold_on_to_is_no_match() -> None:
     poses = [Pose2()]
     store = store_of(ROOM, poses)
     empty = view_of(Scan(0, 0.0, BEARING, np.full(360, np.inf), 0.05, 20.0), table_for(BEARING), farthest_m=20.0)
-    assert match_view(empty, store.arrays(), np.arange(1), rows_of(poses), Pose2()) is None
+    assert match_view(empty, store.kept(), np.arange(1), rows_of(poses), Pose2()) is None
     far = Pose2(200.0, 0.0, 0.0)
-    assert match_view(seen(ROOM, Pose2()), store.arrays(), np.arange(1), rows_of(poses), far) is None
+    assert match_view(seen(ROOM, Pose2()), store.kept(), np.arange(1), rows_of(poses), far) is None
 
 
 def test_a_corridor_seen_every_degree_holds_the_heading() -> None:
@@ -138,7 +138,7 @@ def test_a_corridor_seen_every_degree_holds_the_heading() -> None:
         at = Pose2(0.3, 0.0, math.radians(5.0))
         match = match_view(
             corridor(at.yaw_rad, 2 * k + 1),
-            store.arrays(),
+            store.kept(),
             np.arange(1),
             np.zeros((1, 3)),
             Pose2(0.3, 0.0, 0.0),
@@ -155,10 +155,10 @@ def test_free_space_refutes_a_wrong_place() -> None:
     poses = [Pose2(0.0, 0.0, 0.0)]
     store = store_of(ROOM, poses)
     view = seen(ROOM, Pose2(0.3, 0.2, 0.1))
-    right = agreement(view, store.arrays(), np.arange(1), rows_of(poses), Pose2(0.3, 0.2, 0.1))
+    right = agreement(view, store.kept(), np.arange(1), rows_of(poses), Pose2(0.3, 0.2, 0.1))
     assert right.explained > 0.95
     assert right.refuted < 0.01
-    wrong = agreement(view, store.arrays(), np.arange(1), rows_of(poses), Pose2(-0.9, -0.6, 0.1))
+    wrong = agreement(view, store.kept(), np.arange(1), rows_of(poses), Pose2(-0.9, -0.6, 0.1))
     assert wrong.explained < 0.5
     assert wrong.refuted > 0.15
     assert right.explained + right.refuted + right.unseen == pytest.approx(1.0)
@@ -183,7 +183,7 @@ def test_a_search_finds_what_a_guess_does_not() -> None:
     poses = [Pose2(0.0, 0.0, 0.0), Pose2(1.0, 0.2, 0.5)]
     store = store_of(ROOM, poses)
     truth = Pose2(1.2, -0.4, 0.35)
-    raster = raster_of(store.arrays(), np.arange(2), rows_of(poses))
+    raster = raster_of(store.kept(), np.arange(2), rows_of(poses))
     found = find_view(seen(ROOM, truth), raster, Pose2(-0.9, 1.3, 0.0), window_m=3.0, turn_rad=math.radians(30.0))
     assert found is not None
     assert math.hypot(found.pose.x_m - truth.x_m, found.pose.y_m - truth.y_m) < 0.15
@@ -195,7 +195,7 @@ def test_a_search_finds_what_a_guess_does_not() -> None:
 def test_a_corridor_is_ambiguous() -> None:
     poses = [Pose2(0.0, 0.0, 0.0)]
     store = store_of(CORRIDOR, poses)
-    raster = raster_of(store.arrays(), np.arange(1), rows_of(poses))
+    raster = raster_of(store.kept(), np.arange(1), rows_of(poses))
     found = find_view(seen(CORRIDOR, Pose2()), raster, Pose2(), window_m=3.0, turn_rad=0.2)
     assert found is not None
     assert found.rival > 0.85  # a metre on, it fits nearly as well
@@ -207,7 +207,7 @@ def test_blocks_do_not_hide_the_best(window_m: float) -> None:
     poses = [Pose2(0.0, 0.0, 0.0)]
     store = store_of(ROOM, poses)
     view = seen(ROOM, Pose2(0.3, 0.2, 0.1))
-    raster = raster_of(store.arrays(), np.arange(1), rows_of(poses), window_m=window_m)
+    raster = raster_of(store.kept(), np.arange(1), rows_of(poses), window_m=window_m)
     found = find_view(view, raster, Pose2(), window_m=1.0, turn_rad=math.radians(8.0))
     assert found is not None
     near = np.flatnonzero(view.quality >= 0.0)
@@ -232,7 +232,7 @@ def test_maxima_over_wide_blocks_come_from_those_over_small_ones() -> None:
 
 def test_one_rival_is_enough_where_more_need_not_be_known() -> None:
     store = store_of(CORRIDOR, [Pose2(0.0, 0.0, 0.0)])
-    raster = raster_of(store.arrays(), np.arange(1), rows_of([Pose2()]), window_m=8.0)
+    raster = raster_of(store.kept(), np.arange(1), rows_of([Pose2()]), window_m=8.0)
     view = seen(CORRIDOR, Pose2())
     found = find_view(view, raster, Pose2(), window_m=8.0, turn_rad=0.2, doubtful_share=0.85)
     every = find_view(view, raster, Pose2(), window_m=8.0, turn_rad=0.2)

@@ -56,9 +56,9 @@ def test_doors_tell_how_far_along_also_from_the_other_end(yaw_rad: float, off_m:
     truth = Pose2(0.3, -0.15, yaw_rad)
     view, rows = seen(world, truth, 1), np.arange(len(KEYS))
     guess = Pose2(truth.x_m + off_m, truth.y_m + 0.05, truth.yaw_rad + 0.02)
-    match = match_view(view, store.arrays(), rows, poses, guess)
+    match = match_view(view, store.kept(), rows, poses, guess)
     assert match is not None
-    found = slid(view, store.arrays(), rows, poses, match, prominence=0.04)
+    found = slid(view, store.kept(), rows, poses, match, prominence=0.04)
     assert found is not None
     assert found.pose.x_m == pytest.approx(truth.x_m, abs=0.09)  # three deviations of what it promises
     assert found.pose.y_m == pytest.approx(truth.y_m, abs=0.02)
@@ -70,9 +70,9 @@ def test_bare_walls_tell_nothing_along_themselves(yaw_rad: float) -> None:
     world = corridor(doors=False)
     store, poses = store_of(world)
     view, rows = seen(world, Pose2(0.3, -0.15, yaw_rad), 1), np.arange(len(KEYS))
-    match = match_view(view, store.arrays(), rows, poses, Pose2(0.4, -0.1, yaw_rad))
+    match = match_view(view, store.kept(), rows, poses, Pose2(0.4, -0.1, yaw_rad))
     assert match is not None
-    assert slid(view, store.arrays(), rows, poses, match, prominence=0.04) is None
+    assert slid(view, store.kept(), rows, poses, match, prominence=0.04) is None
 
 
 def test_the_worst_direction_is_that_of_the_corridor() -> None:

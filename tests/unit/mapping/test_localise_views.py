@@ -143,12 +143,12 @@ def test_a_store_gives_back_what_it_took_and_keeps_old_copies() -> None:
     store = ViewStore()
     first = view_of(room_scan(narrow), table_for(narrow), farthest_m=30.0)
     store.add(first)
-    before = store.arrays()
+    before = store.kept()
     for _ in range(100):
         store.add(view_of(room_scan(wide), table_for(wide), farthest_m=30.0))
     assert before.count == 1
-    for arrays in (before, store.arrays()):
-        again = arrays.view(0)
+    for kept in (before, store.kept()):
+        again = kept.view(0)
         assert again.table == first.table
         assert np.array_equal(again.x, first.x)
         assert again.normals == first.normals
@@ -169,9 +169,9 @@ def test_views_that_were_given_up_leave_the_numbers_of_the_others() -> None:
     scans = [Scan(k, 0.0, bearing, np.full(91, 1.0 + 0.01 * k), 0.05, 10.0) for k in range(400)]
     for scan in scans[:300]:
         store.add(view_of(scan, table, farthest_m=30.0))
-    before, size = store.arrays(), store.memory_bytes
+    before, size = store.kept(), store.memory_bytes
     store.give_up(range(0, 280, 2))
-    after = store.arrays()
+    after = store.kept()
     assert store.memory_bytes < 0.6 * size
     assert after.is_there().sum() == 160
     assert not after.is_there()[:280:2].any()
@@ -181,7 +181,7 @@ def test_views_that_were_given_up_leave_the_numbers_of_the_others() -> None:
     for scan in scans[300:]:
         store.add(view_of(scan, table, farthest_m=30.0))
     assert len(store) == 400
-    np.testing.assert_allclose(store.arrays().view(399).x, view_of(scans[399], table, farthest_m=30.0).x)
+    np.testing.assert_allclose(store.kept().view(399).x, view_of(scans[399], table, farthest_m=30.0).x)
     assert before.view(0).points == 91  # what was handed out stays
 
 
@@ -194,4 +194,40 @@ def test_views_are_bounded_by_what_is_not_given_up() -> None:
         if k >= 100:
             store.give_up([k - 100])
         most = max(most, store.memory_bytes)
-    assert most < 500 * (91 + 40) * 20
+    assert most < 500 * (91 + 40) * 8
+
+
+@pytest.mark.parametrize("grazed", [False, True])
+def test_a_view_that_is_opened_again_is_the_same_to_the_last_bit(grazed: bool) -> None:
+    rng = np.random.default_rng(5)
+    store, views = ViewStore(open_most=1), []
+    for k in range(40):
+        bearing = np.sort(rng.uniform(-math.pi, math.pi * rng.choice([0.2, 1.0]), 30 + 20 * k))
+        scan = room_scan(bearing)
+        reach = np.where(rng.random(len(bearing)) < 0.1, math.inf, scan.range_m + rng.normal(0.0, 0.01, len(bearing)))
+        noisy = Scan(0, 0.0, bearing, reach, scan.range_min_m, scan.range_max_m)
+        views.append(view_of(noisy, table_for(bearing), farthest_m=30.0, grazed=grazed))
+        store.add(views[-1])
+    kept = store.kept()
+    for number, view in enumerate(views):
+        again = kept.view(number)
+        assert (again.table, again.points, again.normals) == (view.table, view.points, view.normals)
+        for name in ("x", "y", "nx", "ny", "quality"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(view, name))
+    beside = kept.opened(np.array([3, 39, 0]))
+    for row, number in enumerate((3, 39, 0)):
+        width = views[number].table.bins
+        np.testing.assert_array_equal(beside.nx[row, :width], views[number].nx)
+        assert (beside.quality[row, width:] == -1.0).all()
+        assert tuple(beside.frames[row]) == tuple(views[number].table.frame())
+
+
+def test_views_that_were_given_up_are_not_looked_at() -> None:
+    bearing = np.linspace(-math.pi / 2.0, math.pi / 2.0, 91)
+    table, store = table_for(bearing), ViewStore()
+    for _ in range(200):
+        store.add(view_of(room_scan(bearing), table, farthest_m=30.0))
+    store.give_up(range(100))
+    assert not store.kept().is_there()[99]
+    with pytest.raises(ValueError, match="given up"):
+        store.kept().opened(np.array([150, 99]))

@@ -21,8 +21,9 @@ from mapping.localise.kept_sweeps import kept_sweep
 from mapping.scan import Scan
 from service.background import Background, at_once
 from service.fusion import Cone, Round, Touch
+from service.kept_rounds import KeptTouch
 from service.layers import BuildingLayer, RollingLayer, insert_sweep
-from service.redraw import DELAY_NS, DELAY_NS_PER_KEPT, KeptRound, Redrawer
+from service.redraw import DELAY_NS, DELAY_NS_PER_KEPT, Redrawer
 from service.sensors import Switch
 from service.slam_store import _kept_of, _kept_tile, _mounts_of, _unpack
 from tests.waiting import GIVE_UP_S
@@ -212,9 +213,9 @@ def test_what_was_touched_moves_too_and_is_stored() -> None:
     assert layer.grid.probability_at(felt)[0] > 0.65
     assert not layer.grid.probability_at(pose.apply(np.array([[0.325, 0.0]])))[0] > 0.5  # NaN: unknown
     (kept,) = redrawer.state().kept
-    assert isinstance(kept, KeptRound)
-    (again,) = _kept_of(_unpack(_kept_tile([kept])))
-    assert isinstance(again, KeptRound)
+    assert isinstance(kept, KeptTouch)
+    (again,) = _kept_of(_unpack(_kept_tile([kept])), {})
+    assert isinstance(again, KeptTouch)
     assert (again.sensor, again.key, again.heard) == (kept.sensor, kept.key, kept.heard)
 
 
