@@ -236,6 +236,7 @@ class Daemon:
         self._parts.callback(self._end_recording)
         if config.recording.enabled:
             self._begin_recording(start_pose or IDENTITY, complete=True)
+        self._stored_slam = ()  # a recording from the first byte needed it
         self._publisher.publish_info(robot_info(config, self._wall_ns()))
         self._publisher.announce()
         self._parts.callback(self._stop_makers)

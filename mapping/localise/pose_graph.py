@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.frames import wrap_angles
+from mapping.localise.sparse_factor import symmetric_factor
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -201,9 +202,6 @@ class _Pattern:
 
     def factor(self, x: F64, edges: Edges, weight: F64) -> tuple[tuple[F64, F64], Any]:
         """Weighted Jacobians (E, 3, 3) of both ends, and the factorised normal matrix."""
-        from scipy.sparse import csc_matrix
-        from scipy.sparse.linalg import splu
-
         a, b = _jacobians(x, edges)
         weighted = edges.information * weight[:, None, None]
         wa, wb = weighted @ a, weighted @ b
@@ -215,9 +213,7 @@ class _Pattern:
                 np.full(3, GAUGE),
             ]
         )  # fmt: skip
-        matrix = csc_matrix((values, (self._rows, self._columns)), shape=(self._size, self._size))
-        factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        return (wa, wb), factor
+        return (wa, wb), symmetric_factor(values, self._rows, self._columns, self._size)
 
     def solve(self, x: F64, edges: Edges, weight: F64) -> F64:
         """The Gauss-Newton step (N, 3), to be subtracted."""
