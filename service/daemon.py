@@ -73,7 +73,7 @@ _BACKGROUND_STOP_S = 0.5
 _PUBLISHER_STOP_S = 2.0
 _MAVLINK_STOP_S = 1.0
 _GIVE_BACK_AT_S = (1, 6, 60)  # makers of maps load theirs with the first sweeps, a closure with the first lap
-_TRIM_EVERY_S = 60  # maps that grew and were drawn anew leave holes in the heap
+_TRIM_EVERY_S = 20  # maps that grew and were drawn anew leave holes in the heap
 _GIL_SWITCH_S = 0.0002  # a scan takes the lock some six times; by default each may wait 5 ms for the one that computes
 
 
