@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from mapping.hybrid.planner import Plan, Planner, Way
     from mapping.hybrid.room_book import RoomBook
     from mapping.hybrid.rooms import RoomMap
+    from mapping.hybrid.rooms_before import RoomsBefore
     from mapping.hybrid.voronoi import VoronoiGrid
 
 Bools = NDArray[np.bool_]
@@ -86,12 +87,15 @@ class RoomMaker:
     ) -> None:
         """clearance_m: what plans keep if not told.  width_m: of the robot.  settle_turns: RoomBook's settle."""
         from mapping.hybrid.room_book import RoomBook
+        from mapping.hybrid.rooms_before import RoomsBefore
 
         self.name = "rooms"
         self.sources: frozenset[str] = frozenset()
         self._period_ns = period_ns
         self._clearance_m, self._width_m, self._settle_turns = clearance_m, width_m, settle_turns
         self._book: RoomBook = RoomBook(settle=settle_turns)
+        self._before: RoomsBefore = RoomsBefore(settle=settle_turns)
+        self._is_restored = False
         self._names_changed = False
         self._grid: GridPatch | None = None
         self._found: RoomMap | None = None
@@ -131,9 +135,15 @@ class RoomMaker:
         inside = self._book.territory_mask(shape, patch.row0, patch.col0)
         if here is not None:
             _mark_disc(inside, here, 0.5 * self._width_m / d)
-        self._found = find_rooms(free, d, width_m=self._width_m, inside=inside)
+        if self._is_restored:
+            self._before.begin_with(self._book.territories_in(shape, patch.row0, patch.col0), patch.row0, patch.col0)
+            self._is_restored = False
+        before = self._before.window(shape, patch.row0, patch.col0)
+        found = find_rooms(free, d, width_m=self._width_m, inside=inside, before=before)
+        self._found, settled = self._before.as_told(found, before, here)
         entered = None if here is None else int(self._found.labels[here])
-        self._ids = self._book.update(self._found, row0=patch.row0, col0=patch.col0, entered=entered)
+        self._ids = self._book.update(self._found, row0=patch.row0, col0=patch.col0, entered=entered, settled=settled)
+        self._before.keep(self._found, self._ids, patch.row0, patch.col0)
         self._draw_diagram(free)
         self._find_middles()
         self._turns += 1
@@ -262,6 +272,7 @@ class RoomMaker:
     def restore(self, tiles: Iterable[Tile]) -> None:
         """Ids and names of a stored map. ValueError if they are damaged."""
         from mapping.hybrid.room_book import RoomBook
+        from mapping.hybrid.rooms_before import RoomsBefore
 
         stored = {row: payload for row, _, payload in tiles}
         book, head = RoomBook(settle=self._settle_turns), stored.pop(_NAMES_ROW, None)
@@ -274,6 +285,7 @@ class RoomMaker:
                 raise ValueError(f"names of rooms are damaged: {error}") from error
             book.restore({k: payload for k, payload in stored.items() if payload}, names, next_id)
         self._book, self._told, self._found, self._planner = book, b"", None, None
+        self._before, self._is_restored = RoomsBefore(settle=self._settle_turns), True
         self._ids, self._middles = {}, {}
 
     # --- calls, between two turns of the makers' thread

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from mapping.hybrid.rooms import RoomMap
 
 Bools = NDArray[np.bool_]
+I32 = NDArray[np.int32]
 
 _SAME = 0.5  # of the smaller of territory and region: less in common is another room
 _SWALLOWED = 0.3  # of another's territory: then what the region covers is not one room's alone
@@ -52,10 +54,13 @@ class RoomBook:
         self.changed: set[int] = set()
         """Ids whose territory changed since somebody emptied this."""
 
-    def update(self, found: RoomMap, *, row0: int = 0, col0: int = 0, entered: int | None = None) -> dict[int, int]:
+    def update(
+        self, found: RoomMap, *, row0: int = 0, col0: int = 0, entered: int | None = None, settled: Container[int] = ()
+    ) -> dict[int, int]:
         """Ids of the rooms of a new decomposition, by their number in it; of regions that wait, none.
 
-        row0, col0: place of its first cell on the map.  entered: the room that the robot is in, which need not wait.
+        row0, col0: place of its first cell on the map.  entered: the room that the robot is in, which need not wait, as
+        those that are settled.
         Each region gets one id at most, no id goes to two.
         """
         shared = {room_id: self._shared(known, found, row0, col0) for room_id, known in self._known.items()}
@@ -80,7 +85,7 @@ class RoomBook:
                     continue  # more than this room is in it: what was known of it stands
             else:
                 seen = 1 + self._waited(found, room.number, int(sizes[room.number]), row0, col0)
-                if seen < self._settle and room.number != entered:
+                if seen < self._settle and room.number != entered and room.number not in settled:
                     waiting.append((_territory_of(found, room.number, row0, col0), seen))
                     continue
                 room_id = ids[room.number] = self._next
@@ -106,6 +111,13 @@ class RoomBook:
                     rows.start - top : rows.stop - top, cols.start - left : cols.stop - left
                 ]
         return mask
+
+    def territories_in(self, shape: tuple[int, int], row0: int, col0: int) -> I32:
+        """(R, C) ids of a window, 0 for none; of two rooms that share cells the smaller."""
+        ids = np.zeros(shape, dtype=np.int32)
+        for room_id in sorted(self._known, key=lambda k: (-self._known[k].area, k)):
+            ids[self.territory_mask(shape, row0, col0, only=room_id)] = room_id
+        return ids
 
     def forget_all(self) -> None:
         """The map begins anew. Ids go on from where they were, so that none means two rooms."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +54,8 @@ class RoomRules:
     outline that is open (open_weight). It falls with the clearance in metres (large_weight), and with the sharpness
     of the corners on both sides, of the blunter (jamb_weight, up to blunt_most) and the sharper one (edge_weight, up to
     sharp_most). And with the length of the wall that the cut ends at, free on both sides, beyond stub_m (stub_weight
-    by the metre, up to stub_most_m). Above join it is no door.
+    by the metre, up to stub_most_m). Above join it is no door. Where it is told what rooms there were before, the sum
+    is greater by stay within one of them and less between two.
     """
 
     clutter_m: float = 1.0
@@ -73,6 +75,7 @@ class RoomRules:
     stub_m: float = 0.3
     stub_most_m: float = 0.7
     join: float = 0.27
+    stay: float = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +122,7 @@ def find_rooms(
     *,
     width_m: float = 0.0,
     inside: Bools | None = None,
+    before: I32 | None = None,
 ) -> RoomMap:
     """Rooms and doors of a grid.
 
@@ -126,8 +130,10 @@ def find_rooms(
     width_m: of a robot: openings too narrow for it are no doors, and what lies behind them only is no room (in a grid
     that a robot draws, most often a beam that went past a corner or into the void).
     inside: (R, C), where it is or could come to once; None, or if none of it is wide enough: anywhere that it fits.
+    before: (R, C), from 1 on the rooms that there were, 0 for none: what is about as good stays as it was.
     Time: some 100 ns a cell, twice that with a width. The same cells give the same rooms in the same order.
-    Raises ValueError if free is not (R, C), has a side above 19,998, inside another shape, or a length is none.
+    Raises ValueError if free is not (R, C), has a side above 19,998, inside or before another shape, or a length is
+    none.
     """
     rules, d = rules or RoomRules(), check_resolution(resolution_m)
     given = np.asarray(free, dtype=np.bool_)
@@ -137,6 +143,8 @@ def find_rooms(
         raise ValueError(f"width_m is a length, got {width_m}")
     if inside is not None and inside.shape != given.shape:
         raise ValueError(f"inside has the shape of the free cells, {given.shape}, got {inside.shape}")
+    if before is not None and before.shape != given.shape:
+        raise ValueError(f"before has the shape of the free cells, {given.shape}, got {before.shape}")
     padded, side = np.pad(given, 1), round(rules.clutter_m / d)
     open_space = without_clutter(without_cracks(padded, d), side)
     beside = without_clutter(padded, side) & ~open_space  # cracks, and what stands alone but for them
@@ -149,6 +157,8 @@ def find_rooms(
     slack = max(rules.slack_m / d, _SLACK_CELLS)
     count = kernels.flood(field.squared, order, rules.keep, slack, _less_in_cells(d), basin)
     pieces = _Pieces(field, basin, count, d)
+    if before is not None:
+        pieces.remember(basin, np.pad(before, 1))
     pieces.join_small(rules.room_min_m2 / (d * d))
     pieces.measure_stubs(basin, rules.stub_most_m)
     pieces.join_unconvincing(rules)
@@ -157,6 +167,31 @@ def find_rooms(
     _take_in(labels, beside)
     rooms = _describe(labels, field.squared, order, d)
     return RoomMap(d, np.ascontiguousarray(labels[1:-1, 1:-1]), rooms, doors)
+
+
+def join_rooms(found: RoomMap, pairs: Iterable[tuple[int, int]]) -> tuple[RoomMap, list[int]]:
+    """The same with rooms joined. pairs: numbers of rooms that are one.
+
+    Also the new number of each old one (0 of 0); rooms are numbered in the order they had.
+    """
+    of = list(range(len(found.rooms) + 1))
+    for a, b in pairs:
+        into, other = sorted((of[a], of[b]))
+        of = [into if number == other else number for number in of]
+    numbers = {old: new for new, old in enumerate(sorted(set(of)))}
+    of = [numbers[number] for number in of]
+    rooms = []
+    for number in range(1, len(numbers)):
+        parts = [room for room in found.rooms if of[room.number] == number]
+        widest = max(parts, key=lambda room: (room.clearance_m, -room.number))
+        rooms.append(Room(number, widest.anchor, widest.clearance_m, sum(part.area_m2 for part in parts)))
+    doors = [
+        Door(min(of[door.a], of[door.b]), max(of[door.a], of[door.b]), door.centre, door.ends, door.width_m)
+        for door in found.doors
+        if of[door.a] != of[door.b]
+    ]
+    doors.sort(key=lambda door: (door.a, door.b))
+    return RoomMap(found.resolution_m, np.array(of, dtype=np.int32)[found.labels], tuple(rooms), tuple(doors)), of
 
 
 def without_cracks(free: Bools, cell_m: float) -> Bools:
@@ -244,6 +279,7 @@ class _Pieces:
         self.clearance -= less * self.area
         self.into = list(range(count))
         self.cuts: list[dict[int, _Cut]] = [{} for _ in range(count)]
+        self.before: list[dict[int, float]] = [{} for _ in range(count)]
         self._cell_m = resolution_m
         self._contacts = _contacts(basin, field.squared)
         points, lengths, widest, first = _widest_contacts(self._contacts, count)
@@ -266,6 +302,18 @@ class _Pieces:
         while self.into[k] != k:
             k = self.into[k]
         return k
+
+    def remember(self, basin: I32, before: I32) -> None:
+        """Note how many cells of each piece were in which room before; none of a cell where that is 0."""
+        known = (basin >= 0) & (before > 0)
+        codes, cells = np.unique(basin[known].astype(np.int64) << 32 | before[known], return_counts=True)
+        for code, n in zip(codes.tolist(), cells.tolist()):
+            self.before[code >> 32][code & 0xFFFFFFFF] = float(n)
+
+    def _room_before(self, k: int) -> int:
+        """The room that most of a piece was in; 0 if none."""
+        room, cells = max(self.before[k].items(), key=lambda item: (item[1], -item[0]), default=(0, 0.0))
+        return room if cells > 0.5 * self.area[k] else 0
 
     def join_small(self, cells: float) -> None:
         """Give each piece with fewer cells to the neighbour it is most open to, the smallest first."""
@@ -324,7 +372,9 @@ class _Pieces:
         cut = self.cuts[a][b]
         means = self.clearance[a] / self.area[a], self.clearance[b] / self.area[b]
         smaller = a if self.area[a] < self.area[b] else b
-        return float(
+        rooms = self._room_before(a), self._room_before(b)
+        stay = 0.0 if 0 in rooms else rules.stay if rooms[0] == rooms[1] else -rules.stay
+        return stay + float(
             rules.narrow_weight * min(cut.clearance / min(means), 2.0)
             + rules.wide_weight * min(cut.clearance / max(means), 2.0)
             + rules.open_weight * cut.length / self.outline[smaller]
@@ -342,6 +392,8 @@ class _Pieces:
         self.area[a] += self.area[b]
         self.clearance[a] += self.clearance[b]
         self.outline[a] += self.outline[b] - 2.0 * self.cuts[a].pop(b).length
+        for room, cells in self.before[b].items():
+            self.before[a][room] = self.before[a].get(room, 0.0) + cells
         for other, cut in self.cuts[b].items():
             if other == a:
                 continue

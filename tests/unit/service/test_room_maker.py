@@ -188,6 +188,36 @@ def test_a_room_waits_for_its_id_unless_the_robot_is_in_it() -> None:
     assert ids == [[1], None, [1, 2], None]
 
 
+def test_what_stands_in_a_room_for_a_while_does_not_make_it_two() -> None:
+    """A bug: where a person had walked a room was cut in two for a turn, once a lap, and the half got an id."""
+    maker, pose = RoomMaker(), standing_at(10, 10)
+    for _ in range(5):
+        told(maker, house(), pose)
+    cut = house()
+    cut.cells[30:32, 4:44] = 100
+    for grid in (cut, cut, house(), cut, cut):
+        told(maker, grid, pose)
+        found = maker.found_rooms()
+        assert found is not None
+        assert found.rooms == [1, 2]
+        assert all(np.any(found.labels == number) for number in found.numbers)
+    document = told(maker, cut, pose)
+    assert document is not None
+    assert [room["id"] for room in document["rooms"]] == [1, 2, 3]
+
+
+def test_what_stands_in_a_room_after_a_restart_does_not_make_it_two_either() -> None:
+    maker, pose = RoomMaker(), standing_at(10, 10)
+    for _ in range(5):
+        told(maker, house(), pose)
+    again, cut = RoomMaker(), house()
+    again.restore(maker.changed_tiles())
+    cut.cells[30:32, 4:44] = 100
+    document = told(again, cut, standing_at(50, 10))
+    assert document is not None
+    assert [room["id"] for room in document["rooms"]] == [1, 2]
+
+
 def test_unknown_cells_are_not_planned_through() -> None:
     maker, grid = RoomMaker(clearance_m=0.0, settle_turns=1), house()
     grid.cells[25:35, 54:56] = -1
