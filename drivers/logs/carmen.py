@@ -81,10 +81,13 @@ def read_carmen(path: Path, *, no_echo_m: float | None = None, poses: PoseKind |
     if not found.scans:
         raise LogError(f"{path}: no laser scan in it (skipped: {dict(found.skipped) or 'nothing'})")
     measured = without_fillers(_principal_laser(found))
-    ranges = [s.range_m for s in measured]
-    threshold = no_echo_m if no_echo_m is not None else no_echo_threshold(ranges, found.declared_max_m)
+    found.scans.clear()  # each step copies all ranges: no more than two of these are kept at a time
+    threshold = no_echo_m
+    if threshold is None:
+        threshold = no_echo_threshold([s.range_m for s in measured], found.declared_max_m)
     kind = poses or _pose_kind(path, found)
     scans, repaired, made_up = timed(without_echo_from(measured, threshold))
+    del measured
     odometry = _own_odometry(found, kind, made_up)
     if not _moves(scans):
         scans = posed_by(scans, odometry)

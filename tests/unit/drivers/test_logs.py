@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.logs import LogError, PoseKind, read_log
-from drivers.logs.carmen import field_of_beams
+from drivers.logs.carmen import field_of_beams, read_carmen
 from drivers.logs.log import compose, dead_reckoning, in_order, made_up_stamps, no_echo_threshold, relative
 
 DATA = Path(os.environ.get("UMFELD_DATA", "/nonexistent"))
@@ -424,3 +424,21 @@ def test_a_long_log_is_read_quickly() -> None:
     begin = time.process_time()
     read_log(DATA / "carmen_logs/intel.clf.gz")
     assert time.process_time() - begin < 5.0  # measured: 0.8 s
+
+
+def test_a_long_log_is_held_twice_at_most_while_it_is_read(tmp_path: Path) -> None:
+    """Each step of reading copies all ranges, and none of the copies was let go before the last was made."""
+    scans, beams = 1500, 360
+    path = tmp_path / "long.log"
+    readings = " ".join(f"{2.0 + beam / 100:.2f}" for beam in range(beams))
+    with path.open("w") as file:
+        for number in range(scans):
+            pose = f"{number / 10:.1f} 0.0 0.0"
+            file.write(f"FLASER {beams} {readings} {pose} {pose} {number / 5:.1f} host {number / 5:.1f}\n")
+    tracemalloc.start()
+    log = read_carmen(path)
+    _now, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(log.scans) == scans
+    ranges_bytes = sum(scan.range_m.nbytes for scan in log.scans)
+    assert peak - path.stat().st_size < 2.7 * ranges_bytes
