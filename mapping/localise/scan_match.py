@@ -146,9 +146,7 @@ def match_view(
     )
 
 
-def agreement(
-    view: View, store: KeptViews, rows: I64, poses: F64, pose: Pose2, *, near_m: float = NEAR_M
-) -> Agreement:
+def agreement(view: View, store: KeptViews, rows: I64, poses: F64, pose: Pose2, *, near_m: float = NEAR_M) -> Agreement:
     """How a view at a pose fits what the references saw: the free space they saw counts as much as their walls."""
     votes = np.zeros(3)
     at = np.array([pose.x_m, pose.y_m, pose.yaw_rad])
