@@ -1,12 +1,18 @@
 """How well walls of finished maps hold against scans that are not in them, for docs/algorithms/grids.md.
 
-UMFELD_DATA=folder python bench/walls.py [--only NAME ...] [--bound] [--picture FILE]
+UMFELD_DATA=folder python bench/walls.py [--only NAME ...] [--from N ...] [--control] [--bound] [--picture FILE]
 
-Logs with corrected poses, every 10th scan held back. Two figures in per cent, as `umfeld map build --hold-out 10` tells
-them: held-back end points within 10 cm of the middle of an occupied cell, held-back beams that cross an occupied cell
-more than 20 cm before their end. For grids as counted (occupied from 65 %, and other shares) and for walls found in all
-scans together (mapping.grids.walls; by the defaults, and for other ends_per_pass).
+Logs with corrected poses, every 10th scan held back, from the first on, or from the N-th. Figures in per cent:
 
+    near      held-back end points with an occupied cell within 10 cm: its nearest point, for a cell is a square
+    middle    the same between the middles of the cell they lie in and of the occupied one
+    in        held-back beams that are in an occupied cell more than 20 cm before their end
+    out       held-back beams that are in one and out of it again more than 20 cm before their end
+
+`umfeld map build --hold-out 10` tells the first three. For grids as counted (occupied from 65 %, and other shares) and
+for walls found in all scans together (mapping.grids.walls; by the defaults, and for other ends_per_pass).
+
+--control adds Intel and fr079 by their particle filters' paths, on which nothing was chosen.
 --bound adds what a choice of cells reaches that knows the very beams by which it is judged: chosen greedily and judged
 on the scans in the map, most newly explained end points for each beam that no chosen cell was crossed by before.
 --picture draws the curves, and a piece of belgioioso's map both ways.
@@ -42,31 +48,47 @@ from service.map_build import BEFORE_END_M, NEAR_M, PoseSource, insert_scans, ju
 
 F64 = NDArray[np.float64]
 I8 = NDArray[np.int8]
-Curve = list[tuple[float, float, float]]  # parameter, near, early, the last two in per cent
+Row = tuple[float, float, float, float, float]  # parameter, near, middle, in, out, the last four in per cent
+Curve = list[Row]
+Drawn = list[tuple[float, float, float]]  # parameter, near, in
 
 LOGS: Final = ("belgioioso", "seattle", "acapulco")
+CONTROL: Final = {"intel": 1, "fr079": 2}  # every n-th scan
 EVERY: Final = 10
 PERCENT: Final = (5, 10, 20, 30, 40, 50, 65, 75, 85, 95)
-ENDS_PER_PASS: Final = (0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+ENDS_PER_PASS: Final = (0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 1.05, 1.2, 1.5, 2.0)
 DEFAULT_PERCENT, DEFAULT_ENDS = 65, WallRules().ends_per_pass
 PIECE: Final = (700, 950, 200, 450)  # of belgioioso: rows and columns of its map that are drawn
 
 
 class Trial:
-    """One log in a map, but for every 10th scan."""
+    """One log in a map, but for every 10th scan from the given one on; of dense logs every n-th scan is a scan."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, first: int = 0, every: int = 1) -> None:
         self.log: Log = read_log(path)
-        self.scans: Sequence[LogScan] = self.log.scans
+        self.scans: Sequence[LogScan] = self.log.scans[::every]
         self.poses = poses_from_log(self.log, self.scans, PoseSource.LOG)
-        self.held = list(range(0, len(self.scans), EVERY))
+        self.held = list(range(first, len(self.scans), EVERY))
+        self.inside = sorted(set(range(len(self.scans))) - set(self.held))
         self.grid = OccupancyGrid(resolution_m=0.05, model="log-odds")
         insert_scans(self.grid, self.log, self.scans, self.poses, left_out=set(self.held))
         self.counted = self.grid.patch()
 
-    def judged(self, patch: GridPatch) -> tuple[float, float]:
+    def judged(self, patch: GridPatch) -> tuple[float, float, float, float]:
         found = judge(patch, self.log, [self.scans[k] for k in self.held], self.poses[self.held])
-        return 100.0 * found.near_occupied, 100.0 * found.crossing_early
+        shares = (found.near_occupied, found.near_middle, found.crossing_early, self.leaving(patch))
+        near, middle, early, out = (100.0 * share for share in shares)
+        return near, middle, early, out
+
+    def leaving(self, patch: GridPatch) -> float:
+        """Share of held-back beams that are in an occupied cell, and out of it, more than BEFORE_END_M before their end."""
+        low = np.array([patch.col0, patch.row0], dtype=np.float64)
+        start, stop = (points / patch.resolution_m - low for points in self.beams(self.held)[:2])
+        height, width = patch.cells.shape
+        first, cells = _walks(start, stop, width, height, patch.cells.ravel() >= DEFAULT_PERCENT)
+        col, row = np.floor(stop).astype(np.int64).T
+        beam = np.repeat(np.arange(len(start)), np.diff(first))
+        return len(np.unique(beam[cells != (row * width + col)[beam]])) / max(len(start), 1)
 
     def as_counted(self) -> Curve:
         patch = self.counted
@@ -84,9 +106,10 @@ class Trial:
     def as_found(self) -> tuple[Curve, I8]:
         """The curve, and a piece of the map by the defaults."""
         counts = BeamCounts(self.grid)
-        for index, (scan, pose) in enumerate(zip(self.scans, self.poses)):
-            if index % EVERY:
-                counts.add(Pose2(*pose), scan.bearing_rad, scan.range_m, range_max_m=self.log.range_max_m)
+        robot_from_laser = Pose2(*self.log.robot_from_laser)
+        for k in self.inside:
+            scan, pose = self.scans[k], Pose2(*self.poses[k]) @ robot_from_laser
+            counts.add(pose, scan.bearing_rad, scan.range_m, range_max_m=self.log.range_max_m)
         curve: Curve = []
         default = self.piece()
         for ends in ENDS_PER_PASS:
@@ -95,35 +118,43 @@ class Trial:
             default = self.piece() if ends == DEFAULT_ENDS else default
         return curve, default
 
-    def bound(self) -> Curve:
-        """Chosen on the scans in the map and judged on them, at some shares of crossing beams."""
-        origin, end = self._beams()
-        middle = np.floor(end / self.grid.resolution_m).astype(np.int64)
+    def bound(self) -> Drawn:
+        """Chosen on the scans in the map and judged on them, at some shares of beams that are in a cell early: near."""
+        origin, early, end = (points / self.grid.resolution_m for points in self.beams(self.inside))
+        middle = np.floor(end).astype(np.int64)
         low = middle.min(axis=0) - 4
         width, height = (int(k) for k in middle.max(axis=0) - low + 5)
-        cell_m = self.grid.resolution_m
-        length = np.maximum(np.hypot(*(end - origin).T), 1e-9)
-        early = origin + (end - origin) * np.maximum(0.0, 1.0 - BEFORE_END_M / length)[:, None]
-        reach = np.array(
-            [(r, c) for r in range(-2, 3) for c in range(-2, 3) if np.hypot(r, c) * cell_m <= NEAR_M + 1e-9]
-        )
-        near = (middle[:, 1, None] - low[1] + reach[:, 0]) * width + middle[:, 0, None] - low[0] + reach[:, 1]
+        reach = NEAR_M / self.grid.resolution_m
+        lines, near = [], []
+        for row in range(-3, 4):
+            for col in range(-3, 4):
+                corner = middle + (col, row)
+                away = np.maximum(np.maximum(corner - end, end - (corner + 1)), 0.0)
+                close = np.flatnonzero(np.hypot(*away.T) <= reach)
+                lines.append(close)
+                near.append((corner[close, 1] - low[1]) * width + corner[close, 0] - low[0])
+        order = np.argsort(np.concatenate(lines), kind="stable")
+        first = np.searchsorted(np.concatenate(lines)[order], np.arange(len(end) + 1))
+        cells = np.concatenate(near)[order]
         wanted = np.zeros(width * height, dtype=np.bool_)
-        wanted[near] = True
-        walks, walked = _walks(origin / cell_m - low, early / cell_m - low, width, height, wanted)
-        return _greedy(near.astype(np.int64), walks, walked, width * height)
+        wanted[cells] = True
+        walks, walked = _walks(origin - low, early - low, width, height, wanted)
+        return _greedy(first, cells, walks, walked, width * height)
 
-    def _beams(self) -> tuple[F64, F64]:
-        """Origins and ends (N, 2) of the beams in the map that end somewhere."""
-        origins, ends = [], []
-        for index, (scan, pose) in enumerate(zip(self.scans, self.poses)):
-            if index % EVERY:
-                hit = np.isfinite(scan.range_m)
-                bearing = pose[2] + scan.bearing_rad[hit]
-                way = np.stack((np.cos(bearing), np.sin(bearing)), axis=-1) * scan.range_m[hit, None]
-                origins.append(np.broadcast_to(pose[:2], way.shape))
-                ends.append(pose[:2] + way)
-        return np.concatenate(origins), np.concatenate(ends)
+    def beams(self, scans: Sequence[int]) -> tuple[F64, F64, F64]:
+        """Of the beams that end somewhere: where they begin, BEFORE_END_M before their end, and their end, (N, 2)."""
+        origins, earlies, ends = [], [], []
+        robot_from_laser = Pose2(*self.log.robot_from_laser)
+        for k in scans:
+            scan, pose = self.scans[k], Pose2(*self.poses[k]) @ robot_from_laser
+            hit = np.isfinite(scan.range_m)
+            length, bearing = scan.range_m[hit, None], pose.yaw_rad + scan.bearing_rad[hit]
+            way = np.stack((np.cos(bearing), np.sin(bearing)), axis=-1)
+            origin = np.broadcast_to([pose.x_m, pose.y_m], way.shape)
+            origins.append(origin)
+            earlies.append(origin + way * np.maximum(length - BEFORE_END_M, 0.0))
+            ends.append(origin + way * length)
+        return np.concatenate(origins), np.concatenate(earlies), np.concatenate(ends)
 
 
 @njit
@@ -203,20 +234,19 @@ def _choose(near: Any, near_lines: Any, walk: Any, walk_lines: Any, beams: int, 
     return count
 
 
-def _greedy(near: NDArray[np.int64], first: Any, cells: Any, count: int) -> Curve:
-    beams = len(near)
-    of_near = _by_cell(np.arange(beams + 1) * near.shape[1], near.ravel(), count)
+def _greedy(near_first: Any, near: Any, first: Any, cells: Any, count: int) -> Drawn:
+    beams = len(first) - 1
     steps = np.zeros((count, 2), dtype=np.int64)
-    steps = steps[: _choose(*of_near, *_by_cell(first, cells, count), beams, steps)]
+    steps = steps[: _choose(*_by_cell(near_first, near, count), *_by_cell(first, cells, count), beams, steps)]
     share = 100.0 * steps / beams
-    found: Curve = []
+    found: Drawn = []
     for early in (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0):
         last = int(np.searchsorted(share[:, 1], early, side="right")) - 1
         found.append((early, float(share[last, 0]), float(share[last, 1])))
     return found
 
 
-def picture(curves: dict[str, dict[str, Curve]], piece: tuple[I8, I8] | None, out: Path) -> None:
+def picture(curves: dict[str, dict[str, Drawn]], piece: tuple[I8, I8] | None, out: Path) -> None:
     figure = Figure(figsize=(13.0, 4.6), dpi=80)
     axes = figure.subplots(1, 1 if piece is None else 3, squeeze=False)[0]
     colours = dict(zip(LOGS, ("tab:blue", "tab:green", "tab:red")))
@@ -230,8 +260,8 @@ def picture(curves: dict[str, dict[str, Curve]], piece: tuple[I8, I8] | None, ou
                 if (kind, value) in (("counted", DEFAULT_PERCENT), ("found", DEFAULT_ENDS)):
                     axes[0].plot(y, x, "o", color=colours[name], fillstyle="full" if kind == "found" else "none")
     axes[0].set(xlim=(0.0, 10.0), ylim=(60.0, 100.5))
-    axes[0].set_xlabel("held-back beams that cross a wall, %")
-    axes[0].set_ylabel("held-back end points near a wall, %")
+    axes[0].set_xlabel("held-back beams in a wall 20 cm before their end, %")
+    axes[0].set_ylabel("held-back end points within 10 cm of a wall, %")
     axes[0].grid(visible=True, alpha=0.3)
     axes[0].legend(fontsize=8, loc="lower right")
     for axis, cells in zip(axes[1:], piece or ()):
@@ -245,27 +275,38 @@ def picture(curves: dict[str, dict[str, Curve]], piece: tuple[I8, I8] | None, ou
 def main() -> None:
     parser = argparse.ArgumentParser(description="Walls of finished maps against scans that are not in them.")
     parser.add_argument("--only", nargs="+", default=list(LOGS), choices=LOGS)
+    parser.add_argument("--from", nargs="+", type=int, default=[0], choices=range(EVERY), dest="firsts", metavar="N")
+    parser.add_argument("--control", action="store_true", help="also Intel and fr079")
     parser.add_argument("--bound", action="store_true", help="also what knowing the judge would give")
     parser.add_argument("--picture", type=Path)
     asked = parser.parse_args()
     data = Path(os.environ["UMFELD_DATA"])
-    curves: dict[str, dict[str, Curve]] = {}
+    paths = {name: data / f"known_pose_logs/{name}-corrected.log.gz" for name in asked.only}
+    if asked.control:
+        paths |= {name: data / f"carmen_logs/{name}.gfs.txt.gz" for name in CONTROL}
+    curves: dict[str, dict[str, Drawn]] = {}
     piece = None
-    for name in asked.only:
-        trial = Trial(data / f"known_pose_logs/{name}-corrected.log.gz")
-        before = trial.piece()
-        found, after = trial.as_found()
-        curves[name] = {"counted": trial.as_counted(), "found": found}
+    for name, path in paths.items():
+        rows: dict[str, list[Curve]] = {"counted": [], "found": []}
+        for first in asked.firsts:
+            trial = Trial(path, first=first, every=CONTROL.get(name, 1))
+            before = trial.piece() if name == LOGS[0] else None
+            found, after = trial.as_found()
+            rows["found"].append(found)
+            rows["counted"].append(trial.as_counted())
+            if before is not None and first == asked.firsts[0]:
+                piece = (before, after)
+        for kind, each in rows.items():
+            mean = np.mean(each, axis=0)
+            print(f"{name} {kind}: parameter, near middle in out; held back from {asked.firsts}")
+            for value, *figures in mean.tolist():
+                print(f"    {value:6g}  " + "  ".join(f"{figure:6.2f}" for figure in figures))
+            curves.setdefault(name, {})[kind] = [(row[0], row[1], row[3]) for row in mean.tolist()]
         if asked.bound:
             curves[name]["bound"] = trial.bound()
-        if name == LOGS[0]:
-            piece = (before, after)
-        for kind, curve in curves[name].items():
-            print(
-                f"{name:11} {kind:8}" + "  ".join(f"{value:g}: {near:.1f}/{early:.1f}" for value, near, early in curve)
-            )
+            print(f"{name} bound: " + "  ".join(f"{near:.1f} / {early:.1f}" for _, near, early in curves[name]["bound"]))
     if asked.picture is not None:
-        picture(curves, piece, asked.picture)
+        picture({name: kinds for name, kinds in curves.items() if name in LOGS}, piece, asked.picture)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@
     report.json      counts, timings, memory; with hold_out also how well scans that were left out fit
 
 Two figures judge a grid without knowing the truth (hold_out): of the end points of scans that were not inserted, the
-share within 10 cm of the middle of an occupied cell; of their beams, the share that crosses an occupied cell more
+share within 10 cm of an occupied cell, which is a square; of their beams, the share that is in an occupied cell more
 than 20 cm before its end.
 """
 
@@ -63,11 +63,17 @@ class PoseSource(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class HoldOut:
-    """How scans that were not inserted fit the grid. Shares in [0, 1]; beams without echo are not judged."""
+    """How scans that were not inserted fit the grid. Shares in [0, 1]; beams without echo are not judged.
+
+    near_occupied: of end points, with NEAR_M or less from there to the nearest point of an occupied cell.
+    near_middle: so much between the middles of the cell that they lie in and of an occupied one, which is stricter.
+    crossing_early: of beams, with a point in an occupied cell and BEFORE_END_M or more from there to their end.
+    """
 
     scans: int
     end_points: int
     near_occupied: float
+    near_middle: float
     crossing_early: float
 
 
@@ -234,7 +240,7 @@ def judge(patch: GridPatch, log: Log, scans: Sequence[LogScan], robot_poses: F64
     """Hold scans against a grid they are not in."""
     distance_m = _distance_to(patch.cells >= OCCUPIED_FROM_PERCENT) * patch.resolution_m
     robot_from_laser = Pose2(*log.robot_from_laser)
-    ends = near = early = 0
+    ends = near = near_middle = early = 0
     for scan, pose in zip(scans, robot_poses):
         map_from_laser = Pose2(*pose) @ robot_from_laser
         hit = np.isfinite(scan.range_m)
@@ -243,9 +249,12 @@ def judge(patch: GridPatch, log: Log, scans: Sequence[LogScan], robot_poses: F64
         direction = np.stack((np.cos(bearing), np.sin(bearing)), axis=-1)
         origin = np.array([map_from_laser.x_m, map_from_laser.y_m])
         ends += len(reach)
-        near += int(np.sum(_at(distance_m, patch, origin + reach[:, None] * direction, np.inf) <= NEAR_M))
+        end = origin + reach[:, None] * direction
+        near += int(np.sum(_are_near(patch, end)))
+        near_middle += int(np.sum(_at(distance_m, patch, end, np.inf) <= NEAR_M))
         early += sum(_crosses(distance_m, patch, origin, d, r - BEFORE_END_M) for d, r in zip(direction, reach))
-    return HoldOut(len(scans), ends, near / max(ends, 1), early / max(ends, 1))
+    near_share, middle_share, early_share = (count / max(ends, 1) for count in (near, near_middle, early))
+    return HoldOut(len(scans), ends, near_share, middle_share, early_share)
 
 
 def _distance_to(occupied: NDArray[np.bool_]) -> F64:
@@ -255,6 +264,21 @@ def _distance_to(occupied: NDArray[np.bool_]) -> F64:
     if not occupied.any():
         return np.full(occupied.shape, np.inf)
     return np.asarray(distance_transform_edt(~occupied))
+
+
+def _are_near(patch: GridPatch, points: F64) -> NDArray[np.bool_]:
+    """Whether points (N, 2) have an occupied cell within NEAR_M: its nearest point, not its middle."""
+    at = points / patch.resolution_m
+    reach = NEAR_M / patch.resolution_m
+    around = np.arange(-math.ceil(reach), math.ceil(reach) + 1)
+    offsets = np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 1, 2)
+    low = np.floor(at) + offsets  # (K, N, 2)
+    away = np.maximum(np.maximum(low - at, at - (low + 1.0)), 0.0)
+    cells = low.astype(np.int64) - (patch.col0, patch.row0)
+    inside = np.all((cells >= 0) & (cells < patch.cells.shape[::-1]), axis=-1)
+    cells[~inside] = 0
+    occupied = inside & (patch.cells[cells[..., 1], cells[..., 0]] >= OCCUPIED_FROM_PERCENT)
+    return np.asarray(np.any(occupied & (np.hypot(*np.moveaxis(away, -1, 0)) <= reach), axis=0))
 
 
 def _at(values: F64, patch: GridPatch, points: F64, outside: float) -> F64:
@@ -354,6 +378,7 @@ def report_of(built: Built, patch: GridPatch, source: PoseSource) -> dict[str, o
             "scans": built.hold_out.scans,
             "end_points": built.hold_out.end_points,
             "near_occupied": round(built.hold_out.near_occupied, 5),
+            "near_middle": round(built.hold_out.near_middle, 5),
             "crossing_early": round(built.hold_out.crossing_early, 5),
         }
     return report

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from mapping.grids.geometry import check_resolution
 from mapping.grids.tiles import TILE
-from mapping.grids.walls import HALF_A_BEAM, TileTable, WallRules, blur_weights
+from mapping.grids.walls import HALF_A_BEAM, NEAR, TileTable, WallRules, blur_weights, rule_row
 from mapping.kernels import walls as kernels
 from mapping.kernels.grids import TILE_BITS, TILE_CELLS
 
@@ -52,7 +52,7 @@ class LiveWalls:
         self._max_tiles = max_tiles
         rules = rules if rules is not None else WallRules()
         self._weight = np.ascontiguousarray(blur_weights(rules))
-        self._rule = np.array([rules.ends_per_pass, rules.surely_per_pass])
+        self._rule = rule_row(rules)
         self.clear()
 
     def clear(self) -> None:
@@ -138,7 +138,7 @@ class LiveWalls:
         self._judged[number] = self._beams[number]
         ends, passes = (self._around(counts, place) for counts in (self._ends, self._passes))
         wall = np.zeros(ends.shape, dtype=np.bool_)
-        kernels.judge_window(ends, passes, self._weight, self._rule, HALF_A_BEAM, wall)
+        kernels.judge_window(ends, passes, self._weight, NEAR, self._rule, HALF_A_BEAM, wall)
         return wall[RIM:-RIM, RIM:-RIM].astype(np.uint8)
 
     def _around(self, counts: U8, place: Place) -> U8:

@@ -6,11 +6,15 @@ whole the question is another: which cells explain where beams end, and are cros
 
 - Each beam counts one end in the cell where it ends and one pass in every cell before. Both are spread over the
   neighbours as far as a beam's end may lie from where it was measured (`blur_cells`).
-- A cell explains the ends in itself and in the four cells beside it. Cells are chosen one after the other, each time
-  the one with most ends that no chosen cell explains for the beams that pass it (a weighted cover, greedy), until the
-  best is worth less than `ends_per_pass`.
-- A cell in which no beam ended is no wall, and one in which more ended than passed (`surely_per_pass`) is one anyhow:
-  else walls would move behind the surface, where beams pass seldom, and robots that localise by them with them.
+- Cells in which beams end, more than half as many as pass (`wall_per_pass`), are walls: thick ones, without gaps.
+- They are made thin: cells go, first those that more beams pass than end in, as long as the walls around hang together
+  without them and other walls are near the ends (within two cells). The end of a row in which many beams ended
+  (`tip_per_pass`) stays.
+- Ends that lie farther than two cells from these walls are explained by single cells: chosen one after the other, each
+  time the one with most such ends for the beams that pass it (a weighted cover, greedy), until the best is worth less
+  than `ends_per_pass`.
+- A cell in which no beam ended is no wall: else walls would move behind the surface, where beams pass seldom, and robots
+  that localise by them with them.
 
 So a smeared wall becomes a thin one in the middle of its ends or a little behind, and what was seen once and looked
 through ever after is none. Costs: a walk along every beam, and sorting the cells with ends.
@@ -35,7 +39,10 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 AROUND = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)], dtype=np.int64)
-EXPLAINED = np.array([(0, 0), (-1, 0), (0, -1), (0, 1), (1, 0)], dtype=np.int64)
+NEAR = np.array(
+    [(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 2), (2, 0), (0, -2), (-2, 0), (0, 0)],
+    dtype=np.int64,
+)  # the eight around a cell in turn, those two away, itself: whose ends a wall explains
 PIECE = 1 << 16
 FULL = 65535
 NEIGHBOURS = 2  # cells from an end whose counts matter: a wall may lie beside it, and is blurred over its neighbours
@@ -44,21 +51,30 @@ HALF_A_BEAM = 0.5  # the cost of a cell that nothing passed
 
 @dataclass(frozen=True, slots=True)
 class WallRules:
-    """ends_per_pass: a chosen cell explains at least so many ends for each beam that passes it.
+    """wall_per_pass: a cell in which so many beams ended for each that passed belongs to a wall, which is then made thin.
 
-    surely_per_pass: a cell in which so many beams ended for each that passed is a wall, chosen or not.
+    ends_per_pass: a cell explains at least so many ends for each beam that passes it, else it goes where walls are made
+    thin, and does not come where ends lie far from walls.
+    tip_per_pass: a cell in which so many ended does not go from the end of a row.
     blur_cells: standard deviation of where a beam ends, in cells, at most 0.5 (more needs more than the neighbours).
     """
 
-    ends_per_pass: float = 0.6
-    surely_per_pass: float = 1.0
+    wall_per_pass: float = 0.6
+    ends_per_pass: float = 1.05
+    tip_per_pass: float = 2.0
     blur_cells: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.ends_per_pass <= self.surely_per_pass < math.inf:
-            raise ValueError("ends_per_pass is above 0 and at most surely_per_pass, both finite")
+        for name in ("wall_per_pass", "ends_per_pass", "tip_per_pass"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} is above 0 and finite, got {getattr(self, name)}")
         if not 0.0 < self.blur_cells <= 0.5:
             raise ValueError(f"blur_cells is above 0, at most 0.5, got {self.blur_cells}")
+
+
+def rule_row(rules: WallRules) -> F64:
+    """(3,) as the kernels take them."""
+    return np.array([rules.ends_per_pass, rules.wall_per_pass, rules.tip_per_pass])
 
 
 def blur_weights(rules: WallRules) -> F64:
@@ -142,11 +158,11 @@ class BeamCounts:
         weight = blur_weights(rules).ravel()
         ends, passes = (self._blurred(counts, cells, weight) for counts in (self._ends, self._passes))
         ended, passed = self._at(self._ends, cells), self._at(self._passes, cells)
-        cost = np.where(ended > 0.0, passes + HALF_A_BEAM, np.inf)
-        chosen = np.zeros(len(cells), dtype=np.bool_)
-        kernels.cover(_numbers_of(cells, EXPLAINED), ends, cost, float(rules.ends_per_pass), chosen)
-        chosen |= (ended > 0.0) & (ended >= rules.surely_per_pass * (passed + HALF_A_BEAM))
-        return cells[chosen]
+        wall = np.zeros(len(cells), dtype=np.bool_)
+        kernels.explain(
+            _numbers_of(cells, NEAR), ended, passed + HALF_A_BEAM, ends, passes + HALF_A_BEAM, rule_row(rules), wall
+        )
+        return cells[wall]
 
     def _blurred(self, counts: NDArray[np.uint16], cells: I64, weight: F64) -> F64:
         """Counts (N,) of cells (N, 2) and those AROUND them, by weight (9,)."""

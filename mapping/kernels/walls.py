@@ -125,11 +125,88 @@ def cover(near: Any, ends: Any, cost: Any, least: float, chosen: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def judge_window(ends: Any, passes: Any, weight: Any, rule: Any, half_a_beam: float, wall: Any) -> None:
+def explain(near: Any, ended: Any, passed: Any, ends: Any, cost: Any, rule: Any, wall: Any) -> None:
+    """Which of N cells are walls: those in which beams end, made thin, and those that explain the ends far from them.
+
+    near: (N, 13) numbers of the cells NEAR each one, -1 none, the first eight around it in turn from +col on, the last
+    itself.  ended, passed: (N,) counts of each cell, the second and `cost` with half a beam more.  ends, cost: (N,)
+    the same spread over the neighbours.  rule: ends_per_pass, wall_per_pass, tip_per_pass of WallRules.
+    wall: (N,) bool, written.
+    """
+    stays = np.zeros(len(wall), dtype=np.bool_)
+    for k in range(len(wall)):
+        wall[k] = ended[k] > 0.0 and ended[k] >= rule[1] * passed[k]
+        stays[k] = wall[k] and ended[k] >= rule[2] * passed[k]
+    make_thin(near, ends, cost, rule[0], stays, wall)
+    left, price = ends.copy(), cost.copy()
+    for k in range(len(wall)):
+        if ended[k] == 0.0:
+            price[k] = np.inf
+        if wall[k]:
+            for j in range(near.shape[1]):
+                if near[k, j] >= 0:
+                    left[near[k, j]] = 0.0
+    cover(near, left, price, rule[0], wall)
+
+
+@njit(cache=True, nogil=True)
+def make_thin(near: Any, ends: Any, cost: Any, least: float, stays: Any, wall: Any) -> None:
+    """Take cells out of walls where that opens no gap, first those that more beams pass than end in.
+
+    near, ends, cost, wall: as in `explain`.  A cell goes unless ends that no other wall is near are `least` of its cost,
+    and only if the walls around it hang together without it (8-connected). The last cell of a row of walls goes only if
+    it is not one that stays.
+    """
+    walls_near = np.zeros(len(wall), dtype=np.int16)
+    asked = [(0.0, 0) for _ in range(0)]
+    for k in range(len(wall)):
+        if wall[k]:
+            asked.append((ends[k] - cost[k], k))
+            for j in range(near.shape[1]):
+                if near[k, j] >= 0:
+                    walls_near[near[k, j]] += 1
+    heapq.heapify(asked)
+    while len(asked) > 0:
+        worth, k = heapq.heappop(asked)
+        if not wall[k]:
+            continue
+        alone = 0.0
+        for j in range(near.shape[1]):
+            if near[k, j] >= 0 and walls_near[near[k, j]] == 1:
+                alone += ends[near[k, j]]
+        if alone >= least * cost[k] or not _may_go(near[k], stays[k], wall):
+            continue
+        wall[k] = False
+        for j in range(near.shape[1]):
+            if near[k, j] >= 0:
+                walls_near[near[k, j]] -= 1
+        for j in range(8):  # those of less worth were asked before: now they may go
+            beside = np.int64(near[k, j])
+            if beside >= 0 and wall[beside] and ends[beside] - cost[beside] <= worth:
+                heapq.heappush(asked, (ends[beside] - cost[beside], beside))
+
+
+@njit(cache=True, nogil=True)
+def _may_go(near: Any, stays: bool, wall: Any) -> bool:
+    """Whether walls around a cell, near (13,), hang together without it: Yokoi's number for 8-connected figures is 1."""
+    count, parts = 0, 0
+    for j in range(8):
+        count += near[j] >= 0 and wall[near[j]]
+    for j in range(0, 8, 2):
+        if not (near[j] >= 0 and wall[near[j]]):
+            corner, side = near[j + 1], near[(j + 2) % 8]
+            parts += (corner >= 0 and wall[corner]) or (side >= 0 and wall[side])
+    return count == 0 or (parts == 1 and not (count == 1 and stays))
+
+
+@njit(cache=True, nogil=True)
+def judge_window(
+    ends: Any, passes: Any, weight: Any, offsets: Any, rule: Any, half_a_beam: float, wall: Any
+) -> None:  # fmt: skip
     """Which cells of a rectangle are walls, as BeamCounts.walls says it, what lies outside not being known.
 
-    ends, passes: (R, C) counts.  weight: (3, 3) of a cell and those around it.  rule: ends_per_pass, surely_per_pass.
-    wall: (R, C) bool, written; its outermost rows and columns are none.
+    ends, passes: (R, C) counts.  weight: (3, 3) of a cell and those around it.  offsets: (13, 2) of the cells NEAR one.
+    rule: as in `explain`.  wall: (R, C) bool, written; its outermost rows and columns are none.
     """
     rows, cols = ends.shape
     number = np.full((rows, cols), -1, dtype=np.int32)
@@ -140,28 +217,29 @@ def judge_window(ends: Any, passes: Any, weight: Any, rule: Any, half_a_beam: fl
             if np.any(ends[row - 1 : row + 2, col - 1 : col + 2]):
                 number[row, col] = count
                 count += 1
-    near = np.empty((count, 5), dtype=np.int32)
-    ended, cost = np.zeros(count), np.zeros(count)
+    near = np.full((count, len(offsets)), -1, dtype=np.int32)
+    ended, passed, spread, cost = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
     for row in range(1, rows - 1):
         for col in range(1, cols - 1):
             k = number[row, col]
             if k < 0:
                 continue
-            passed = 0.0
+            ended[k], passed[k] = ends[row, col], passes[row, col] + half_a_beam
+            cost[k] = half_a_beam
             for i in range(3):
                 for j in range(3):
-                    ended[k] += weight[i, j] * ends[row + i - 1, col + j - 1]
-                    passed += weight[i, j] * passes[row + i - 1, col + j - 1]
-            cost[k] = passed + half_a_beam if ends[row, col] > 0 else np.inf
-            near[k, 0], near[k, 1], near[k, 2] = k, number[row - 1, col], number[row, col - 1]
-            near[k, 3], near[k, 4] = number[row, col + 1], number[row + 1, col]
+                    spread[k] += weight[i, j] * ends[row + i - 1, col + j - 1]
+                    cost[k] += weight[i, j] * passes[row + i - 1, col + j - 1]
+            for j in range(len(offsets)):
+                at_row, at_col = row + offsets[j, 0], col + offsets[j, 1]
+                if 0 <= at_row < rows and 0 <= at_col < cols:
+                    near[k, j] = number[at_row, at_col]
     chosen = np.zeros(count, dtype=np.bool_)
-    cover(near, ended, cost, rule[0], chosen)
+    explain(near, ended, passed, spread, cost, rule, chosen)
     for row in range(1, rows - 1):
         for col in range(1, cols - 1):
-            if ends[row, col] > 0:
-                surely = ends[row, col] >= rule[1] * (passes[row, col] + half_a_beam)
-                wall[row, col] = surely or chosen[number[row, col]]
+            if number[row, col] >= 0:
+                wall[row, col] = chosen[number[row, col]]
 
 
 @njit(cache=True, nogil=True)

@@ -147,10 +147,10 @@ def made(name: str, **grid: object) -> Made:
 @needs_data
 @pytest.mark.parametrize(
     ("name", "near", "early"),
-    [("belgioioso", 0.96, 0.032), ("seattle", 0.99, 0.027)],  # measured 0.962, 0.031 and 0.993, 0.026
+    [("belgioioso", 0.96, 0.025), ("seattle", 0.99, 0.021)],  # measured 0.966, 0.0245 and 0.996, 0.0205
 )
 def test_the_daemons_walls_are_crisp(name: str, near: float, early: float) -> None:
-    """Cells as counted give 0.895, 0.032 and 0.977, 0.037 here."""
+    """Cells as counted give 0.919, 0.032 and 0.979, 0.037 here."""
     crisp = made(name)
     assert crisp.published == crisp.exported
     assert crisp.published.near_occupied >= near
