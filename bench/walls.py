@@ -12,7 +12,7 @@ Logs with corrected poses, every 10th scan held back, from the first on, or from
 `umfeld map build --hold-out 10` tells the first three. For grids as counted (occupied from 65 %, and other shares) and
 for walls found in all scans together (mapping.grids.walls; by the defaults, and for other ends_per_pass).
 
---control adds Intel and fr079 by their particle filters' paths, on which nothing was chosen.
+--control adds Intel and fr079 by their particle filters' paths, on which nothing was chosen, by the defaults.
 --bound adds what a choice of cells reaches that knows the very beams by which it is judged: chosen greedily and judged
 on the scans in the map, most newly explained end points for each beam that no chosen cell was crossed by before.
 --picture draws the curves, and a piece of belgioioso's map both ways.
@@ -57,6 +57,7 @@ CONTROL: Final = {"intel": 1, "fr079": 2}  # every n-th scan
 EVERY: Final = 10
 PERCENT: Final = (5, 10, 20, 30, 40, 50, 65, 75, 85, 95)
 ENDS_PER_PASS: Final = (0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 1.05, 1.2, 1.5, 2.0)
+SAME_S: Final = 1e-3
 DEFAULT_PERCENT, DEFAULT_ENDS = 65, WallRules().ends_per_pass
 PIECE: Final = (700, 950, 200, 450)  # of belgioioso: rows and columns of its map that are drawn
 
@@ -64,10 +65,14 @@ PIECE: Final = (700, 950, 200, 450)  # of belgioioso: rows and columns of its ma
 class Trial:
     """One log in a map, but for every 10th scan from the given one on; of dense logs every n-th scan is a scan."""
 
-    def __init__(self, path: Path, *, first: int = 0, every: int = 1) -> None:
+    def __init__(self, path: Path, *, first: int = 0, every: int = 1, way: Path | None = None) -> None:
+        """way: lines of stamp, x, y, yaw of the robot, for scans of the same stamps; else by the log's own poses."""
         self.log: Log = read_log(path)
         self.scans: Sequence[LogScan] = self.log.scans[::every]
-        self.poses = poses_from_log(self.log, self.scans, PoseSource.LOG)
+        if way is None:
+            self.poses = poses_from_log(self.log, self.scans, PoseSource.LOG)
+        else:
+            self.scans, self.poses = _on_the_way(self.log.scans, np.loadtxt(way), every)
         self.held = list(range(first, len(self.scans), EVERY))
         self.inside = sorted(set(range(len(self.scans))) - set(self.held))
         self.grid = OccupancyGrid(resolution_m=0.05, model="log-odds")
@@ -81,7 +86,7 @@ class Trial:
         return near, middle, early, out
 
     def leaving(self, patch: GridPatch) -> float:
-        """Share of held-back beams that are in an occupied cell, and out of it, more than BEFORE_END_M before their end."""
+        """Share of held-back beams that have crossed an occupied cell more than BEFORE_END_M before their end."""
         low = np.array([patch.col0, patch.row0], dtype=np.float64)
         start, stop = (points / patch.resolution_m - low for points in self.beams(self.held)[:2])
         height, width = patch.cells.shape
@@ -90,10 +95,10 @@ class Trial:
         beam = np.repeat(np.arange(len(start)), np.diff(first))
         return len(np.unique(beam[cells != (row * width + col)[beam]])) / max(len(start), 1)
 
-    def as_counted(self) -> Curve:
+    def as_counted(self, percents: Sequence[int]) -> Curve:
         patch = self.counted
         curve: Curve = []
-        for percent in PERCENT:
+        for percent in percents:
             cells = np.where(patch.cells >= percent, 100, 0).astype(np.int8)
             curve.append((percent, *self.judged(GridPatch(patch.resolution_m, patch.row0, patch.col0, cells))))
         return curve
@@ -103,7 +108,7 @@ class Trial:
         row, col = self.counted.row0, self.counted.col0
         return self.grid.cells_in(Window(row + row0, row + row1, col + col0, col + col1))
 
-    def as_found(self) -> tuple[Curve, I8]:
+    def as_found(self, ends_per_pass: Sequence[float]) -> tuple[Curve, I8]:
         """The curve, and a piece of the map by the defaults."""
         counts = BeamCounts(self.grid)
         robot_from_laser = Pose2(*self.log.robot_from_laser)
@@ -112,7 +117,7 @@ class Trial:
             counts.add(pose, scan.bearing_rad, scan.range_m, range_max_m=self.log.range_max_m)
         curve: Curve = []
         default = self.piece()
-        for ends in ENDS_PER_PASS:
+        for ends in ends_per_pass:
             self.grid.call_occupied(counts.walls(WallRules(ends_per_pass=ends)))
             curve.append((ends, *self.judged(self.grid.patch())))
             default = self.piece() if ends == DEFAULT_ENDS else default
@@ -155,6 +160,14 @@ class Trial:
             earlies.append(origin + way * np.maximum(length - BEFORE_END_M, 0.0))
             ends.append(origin + way * length)
         return np.concatenate(origins), np.concatenate(earlies), np.concatenate(ends)
+
+
+def _on_the_way(scans: Sequence[LogScan], way: F64, every: int) -> tuple[Sequence[LogScan], F64]:
+    """Every n-th of the scans at a stamp of the way (N, 4), and the poses (M, 3) there."""
+    stamps = np.array([scan.stamp_s for scan in scans])
+    nearest = np.abs(way[:, 0, None] - stamps).argmin(axis=1)
+    same = np.flatnonzero(np.abs(stamps[nearest] - way[:, 0]) < SAME_S)[::every]
+    return [scans[k] for k in nearest[same]], way[same, 1:]
 
 
 @njit
@@ -283,17 +296,18 @@ def main() -> None:
     data = Path(os.environ["UMFELD_DATA"])
     paths = {name: data / f"known_pose_logs/{name}-corrected.log.gz" for name in asked.only}
     if asked.control:
-        paths |= {name: data / f"carmen_logs/{name}.gfs.txt.gz" for name in CONTROL}
+        paths |= {name: data / f"carmen_logs/{name}.clf.gz" for name in CONTROL}
     curves: dict[str, dict[str, Drawn]] = {}
     piece = None
     for name, path in paths.items():
         rows: dict[str, list[Curve]] = {"counted": [], "found": []}
         for first in asked.firsts:
-            trial = Trial(path, first=first, every=CONTROL.get(name, 1))
+            way = data / f"carmen_logs/{name}.gfs.txt.gz" if name in CONTROL else None
+            trial = Trial(path, first=first, every=CONTROL.get(name, 1), way=way)
             before = trial.piece() if name == LOGS[0] else None
-            found, after = trial.as_found()
+            found, after = trial.as_found((DEFAULT_ENDS,) if name in CONTROL else ENDS_PER_PASS)
             rows["found"].append(found)
-            rows["counted"].append(trial.as_counted())
+            rows["counted"].append(trial.as_counted((DEFAULT_PERCENT,) if name in CONTROL else PERCENT))
             if before is not None and first == asked.firsts[0]:
                 piece = (before, after)
         for kind, each in rows.items():
@@ -302,9 +316,11 @@ def main() -> None:
             for value, *figures in mean.tolist():
                 print(f"    {value:6g}  " + "  ".join(f"{figure:6.2f}" for figure in figures))
             curves.setdefault(name, {})[kind] = [(row[0], row[1], row[3]) for row in mean.tolist()]
-        if asked.bound:
+        if asked.bound and name in LOGS:
             curves[name]["bound"] = trial.bound()
-            print(f"{name} bound: " + "  ".join(f"{near:.1f} / {early:.1f}" for _, near, early in curves[name]["bound"]))
+            print(
+                f"{name} bound: " + "  ".join(f"{near:.1f} / {early:.1f}" for _, near, early in curves[name]["bound"])
+            )
     if asked.picture is not None:
         picture({name: kinds for name, kinds in curves.items() if name in LOGS}, piece, asked.picture)
 

@@ -13,8 +13,8 @@ whole the question is another: which cells explain where beams end, and are cros
 - Ends that lie farther than two cells from these walls are explained by single cells: chosen one after the other, each
   time the one with most such ends for the beams that pass it (a weighted cover, greedy), until the best is worth less
   than `ends_per_pass`.
-- A cell in which no beam ended is no wall: else walls would move behind the surface, where beams pass seldom, and robots
-  that localise by them with them.
+- A cell in which no beam ended is no wall: else walls would move behind the surface, where beams pass seldom, and
+  robots that localise by them with them.
 
 So a smeared wall becomes a thin one in the middle of its ends or a little behind, and what was seen once and looked
 through ever after is none. Costs: a walk along every beam, and sorting the cells with ends.
@@ -51,10 +51,10 @@ HALF_A_BEAM = 0.5  # the cost of a cell that nothing passed
 
 @dataclass(frozen=True, slots=True)
 class WallRules:
-    """wall_per_pass: a cell in which so many beams ended for each that passed belongs to a wall, which is then made thin.
+    """wall_per_pass: a cell in which so many beams ended for each that passed belongs to a wall, which is made thin.
 
-    ends_per_pass: a cell explains at least so many ends for each beam that passes it, else it goes where walls are made
-    thin, and does not come where ends lie far from walls.
+    ends_per_pass: a cell explains at least so many ends for each beam that passes it; else it goes where walls are made
+    thin, if that opens no gap, and does not come where ends lie far from walls.
     tip_per_pass: a cell in which so many ended does not go from the end of a row.
     blur_cells: standard deviation of where a beam ends, in cells, at most 0.5 (more needs more than the neighbours).
     """

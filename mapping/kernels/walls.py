@@ -153,9 +153,9 @@ def explain(near: Any, ended: Any, passed: Any, ends: Any, cost: Any, rule: Any,
 def make_thin(near: Any, ends: Any, cost: Any, least: float, stays: Any, wall: Any) -> None:
     """Take cells out of walls where that opens no gap, first those that more beams pass than end in.
 
-    near, ends, cost, wall: as in `explain`.  A cell goes unless ends that no other wall is near are `least` of its cost,
-    and only if the walls around it hang together without it (8-connected). The last cell of a row of walls goes only if
-    it is not one that stays.
+    near, ends, cost, wall: as in `explain`.  A cell goes unless the ends that no other wall is near are `least` of its
+    cost, and only if the walls around it hang together without it (8-connected). The last cell of a row of walls goes
+    only if it is not one that stays.
     """
     walls_near = np.zeros(len(wall), dtype=np.int16)
     asked = [(0.0, 0) for _ in range(0)]
@@ -188,7 +188,7 @@ def make_thin(near: Any, ends: Any, cost: Any, least: float, stays: Any, wall: A
 
 @njit(cache=True, nogil=True)
 def _may_go(near: Any, stays: bool, wall: Any) -> bool:
-    """Whether walls around a cell, near (13,), hang together without it: Yokoi's number for 8-connected figures is 1."""
+    """Whether walls around a cell, near (13,), hang together without it (Yokoi's number for 8-connected figures)."""
     count, parts = 0, 0
     for j in range(8):
         count += near[j] >= 0 and wall[near[j]]
