@@ -181,7 +181,7 @@ def make_thin(near: Any, ends: Any, cost: Any, least: float, stays: Any, wall: A
             if near[k, j] >= 0:
                 walls_near[near[k, j]] -= 1
         for j in range(8):  # those of less worth were asked before: now they may go
-            beside = np.int64(near[k, j])
+            beside: Any = np.int64(near[k, j])
             if beside >= 0 and wall[beside] and ends[beside] - cost[beside] <= worth:
                 heapq.heappush(asked, (ends[beside] - cost[beside], beside))
 
