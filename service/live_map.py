@@ -19,7 +19,7 @@ from mapping.grids.occupancy import GridTile, OccupancyGrid
 from mapping.grids.tiles import TILE
 from service.errors import Trouble
 from service.layers import BuildingLayer
-from service.map_makers import MapMakers
+from service.map_makers import MakersBusy, MapMakers
 from service.new_map import keep_and_empty, keep_replaced, told
 from service.rpc import CallRefused
 from service.store import OCCUPANCY, SUFFIX, MapStore, SnapshotQueue, Tile, list_maps, occupancy_tiles
@@ -34,6 +34,8 @@ SLAM = "slam"
 
 ANCHOR = "anchor"
 """Meta: latitude_deg, longitude_deg, height_m, yaw_deg of the map's origin and x axis."""
+
+_MAKERS_WAIT_S = 1.0  # a snapshot goes on without them
 
 T = TypeVar("T")
 
@@ -90,26 +92,42 @@ class LiveMap:
         self._makers = makers
         self._disk = threading.RLock()  # what is on it and the live map change together: no snapshot between
         self._settle_walls = settle_walls
+        self._makers_left_out = 0
         self._anchor = store.get_meta(ANCHOR) if anchor is None and store is not None else anchor
 
     # --- while running
 
-    def snapshot(self) -> bool:
-        """Write what changed since the last one; False if the disk refused (it is tried again with the next)."""
-        with self._disk:
-            return self._queue is None or self._write(self._queue)
+    def snapshot(self, *, is_whole: bool = False) -> bool:
+        """Write what changed since the last one; False if the disk refused (it is tried again with the next).
 
-    def _write(self, queue: SnapshotQueue) -> bool:
+        While slow maps are being drawn theirs stay for the next one, and are counted (`makers_left_out`).
+        is_whole: MakersBusy instead.
+        """
+        with self._disk:
+            return self._queue is None or self._write(self._queue, is_whole)
+
+    def _write(self, queue: SnapshotQueue, is_whole: bool) -> bool:
         changed, pose, slam = self._ask(self._changed)
         if slam is not None:
             queue.offer(SLAM, slam())
         if changed:
             queue.offer(GRID, ((tile.tile_row, tile.tile_col, tile.payload()) for tile in changed))
             queue.offer(OCCUPANCY, occupancy_of(changed), self._meta(pose))
-        for name, tiles in ({} if self._makers is None else self._makers.changed_tiles()).items():
+        for name, tiles in self._made(is_whole).items():
             if tiles:
                 queue.offer(name, tiles)
         return queue.commit()
+
+    def _made(self, is_whole: bool) -> dict[str, list[Tile]]:
+        if self._makers is None:
+            return {}
+        if is_whole:
+            return self._makers.changed_tiles()
+        try:
+            return self._makers.changed_tiles(_MAKERS_WAIT_S)
+        except MakersBusy:
+            self._makers_left_out += 1
+            return {}
 
     def _changed(self) -> tuple[list[GridTile], Pose2 | None, Callable[[], list[Tile]] | None]:
         self._layer.show_walls()
@@ -117,7 +135,15 @@ class LiveMap:
 
     def counters(self) -> dict[str, int]:
         """Commits and tiles written, and what failed."""
-        return {} if self._queue is None else {**self._queue.counts, "store_waiting": self._queue.waiting}
+        return (
+            {}
+            if self._queue is None
+            else {
+                **self._queue.counts,
+                "store_waiting": self._queue.waiting,
+                "makers_left_out": self._makers_left_out,
+            }
+        )
 
     def trouble(self) -> str | None:
         """Why the last snapshot was not written."""
@@ -128,14 +154,19 @@ class LiveMap:
         self._ask(self._fusion.drain)
         if self._store is None:
             return
-        self._find_walls()
+        try:
+            self._find_walls(0.0)
+        except MakersBusy:
+            log.warning(
+                "stopped while slow maps were being drawn: the grid is saved, they stay as they were saved before"
+            )
         if not self.snapshot():
             raise Trouble(self.trouble() or f"{self._store.path}: not saved")
         self._store.keep_generation()
 
-    def _find_walls(self) -> None:
+    def _find_walls(self, limit_s: float | None = None) -> None:
         if self._makers is not None:
-            self._makers.ask(self._settle_walls)
+            self._makers.ask(self._settle_walls, *(() if limit_s is None else (limit_s,)))
 
     def _meta(self, pose: Pose2 | None) -> dict[str, Any]:
         grid = self._layer.grid
@@ -156,7 +187,7 @@ class LiveMap:
         store = self._needed_store()
         with self._disk:
             self._find_walls()
-            if not self.snapshot():
+            if not self.snapshot(is_whole=True):
                 raise CallRefused(f"not saved: {self.trouble()}")
             return store.save_as(store.path.parent / f"{name}{SUFFIX}").document()
 
@@ -178,7 +209,7 @@ class LiveMap:
         self._check_tiles(path, tiles)
         with self._disk:
             self._find_walls()
-            if not self.snapshot():  # else older tiles would wait behind what is written next
+            if not self.snapshot(is_whole=True):  # else older tiles would wait behind what is written next
                 raise CallRefused(f"not loaded: {self.trouble()}; the live map is as it was")
             kept = keep_replaced(store)
             meta = {**self._meta(None), ANCHOR: anchor}
@@ -199,7 +230,7 @@ class LiveMap:
         store = self._needed_store()
         with self._disk:
             self._find_walls()
-            if not self.snapshot():
+            if not self.snapshot(is_whole=True):
                 raise CallRefused(f"no new map is begun, since the old one cannot be kept: {self.trouble()}")
             answer = keep_and_empty(store, name, wall_ns=store.wall_ns())
             self._anchor = None

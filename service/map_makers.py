@@ -44,8 +44,10 @@ _GRIDS_WAITING_MAX = 256
 _ODOMETRY_WAITING_MAX = 4096
 _TURN_S = 0.1
 _ASK_LIMIT_S = 10.0
+_DRAWN_TO_THE_END = 0.6  # of the time there is to stop in
 Tile = tuple[int, int, bytes]
 Sweep = tuple[str, Scan, F64]
+Question = tuple[Callable[[], object], threading.Event, list[object]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +151,10 @@ class Counting(Protocol):
         """By name; the names are always the same."""
 
 
+class MakersBusy(Trouble):
+    """The thread of the slow maps is in a turn that lasts; what it was asked is not done, now or later."""
+
+
 class _Desk:
     """What the thread remembers of one maker. takes_*: what it wants besides sweeps, None if it does not: asking a
     protocol every turn costs more than most turns."""
@@ -174,16 +180,18 @@ class MapMakers:
         self._offer = offer
         self._now_ns = now_ns
         self._sweeps: deque[Sweep] = deque()
-        self._redrawn: Sequence[Callable[[], Sweep]] | None = None
+        self._redrawn: Iterable[Callable[[], Sweep]] | None = None
         self._replaced: Mapping[str, Sequence[Tile]] | None = None
         self._grids: deque[GridOut | GridUpdateOut] = deque()
         self._clouds: deque[CloudOut] = deque()
         self._looks: deque[LookOut] = deque()
         self._odometry: deque[OdomOut] = deque()
         self._wants_odometry = any(desk.takes_odometry is not None for desk in self._desks)
-        self._asked: deque[tuple[Callable[[], object], threading.Event, list[object]]] = deque()
+        self._asked: deque[Question] = deque()
         self._changed = threading.Condition()
         self._stopping = False
+        self._is_cut_short = False
+        self._half_drawn: set[str] = set()
         self._thread = threading.Thread(target=self._run, name="maps", daemon=True)
         self._mirror = _Mirror()
         self._pose: PoseOut | None = None
@@ -214,12 +222,18 @@ class MapMakers:
         self._thread.start()
 
     def stop(self, deadline_s: float) -> bool:
-        """End after the turn under way; False if that took longer."""
+        """End after the turn under way; False if that took longer.
+
+        Where it draws maps anew and that would take too long they are left half drawn: nothing of them is given out to
+        be kept then.
+        """
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
         if self._thread.is_alive():
-            self._thread.join(deadline_s)
+            self._thread.join(_DRAWN_TO_THE_END * deadline_s)
+            self._is_cut_short = self._thread.is_alive()
+            self._thread.join((1.0 - _DRAWN_TO_THE_END) * deadline_s)
         return not self._thread.is_alive()
 
     def take_sweep(self, source: str, scan: Scan, map_from_sensor: F64) -> None:
@@ -239,7 +253,7 @@ class MapMakers:
             self._sweeps.popleft()
             self.counts["makers.sweeps_lost"] += 1
 
-    def redraw(self, sweeps: Sequence[Callable[[], Sweep]]) -> None:
+    def redraw(self, sweeps: Iterable[Callable[[], Sweep]]) -> None:
         """The map was corrected: these are the sweeps it is made of, where they lie now. Never blocks."""
         with self._changed:
             self._redrawn = sweeps
@@ -279,25 +293,47 @@ class MapMakers:
                         self._grids.popleft()
                         self.counts["makers.grids_lost"] += 1
 
-    def ask(self, work: Callable[[], T]) -> T:
-        """Run a function between two turns and give its result: for calls that look into a maker's map."""
+    def ask(self, work: Callable[[], T], limit_s: float = _ASK_LIMIT_S) -> T:
+        """Run a function between two turns and give its result: for calls that look into a maker's map.
+
+        MakersBusy if it was not begun within limit_s.
+        """
         if not self._thread.is_alive() or threading.current_thread() is self._thread:
             self._take_replaced()
             return work()
         done, result = threading.Event(), list[object]()
+        question: Question = (work, done, result)
         with self._changed:
-            self._asked.append((work, done, result))
+            self._asked.append(question)
             self._changed.notify_all()
-        if not done.wait(_ASK_LIMIT_S):
-            raise Trouble(f"the thread of the slow maps did not answer within {_ASK_LIMIT_S:.0f} s; see its log")
+        if not done.wait(limit_s):
+            self._take_back(question, limit_s)
+            if not done.wait(_ASK_LIMIT_S):  # under way: what it gives out must not be lost
+                raise Trouble(f"the thread of the slow maps did not end a question within {_ASK_LIMIT_S:.0f} s")
         error, value = result
         if isinstance(error, BaseException):
             raise error
         return value  # type: ignore[return-value]
 
-    def changed_tiles(self) -> dict[str, list[Tile]]:
-        """By layer of the store."""
-        return self.ask(lambda: {layer_of(desk.maker): desk.maker.changed_tiles() for desk in self._desks})
+    def _take_back(self, question: Question, limit_s: float) -> None:
+        with self._changed:
+            if any(waiting is question for waiting in self._asked):
+                self._asked = deque(waiting for waiting in self._asked if waiting is not question)
+                raise MakersBusy(
+                    f"lines, rooms and other slow maps are being drawn and did not answer within {limit_s:.0f} s: "
+                    "the computer is busy, or the map was just corrected; try again in a moment"
+                )
+
+    def changed_tiles(self, limit_s: float = _ASK_LIMIT_S) -> dict[str, list[Tile]]:
+        """By layer of the store. MakersBusy: nothing was taken, it all comes with the next call."""
+        return self.ask(
+            lambda: {
+                layer_of(desk.maker): desk.maker.changed_tiles()
+                for desk in self._desks
+                if desk.maker.name not in self._half_drawn
+            },
+            limit_s,
+        )
 
     def restore(self, load: Callable[[str], Iterable[Tile]]) -> None:
         """Take up every maker's map from the store's layers; a damaged one begins empty and says so."""
@@ -380,6 +416,8 @@ class MapMakers:
         for output in grids:
             self._note(self._mirror.take(output))
         for desk in self._desks:
+            if desk.maker.name in self._half_drawn:
+                continue
             if desk.takes_odometry is not None:
                 for odom in odometry:
                     self._guard(desk, partial(desk.takes_odometry, odom))
@@ -407,6 +445,10 @@ class MapMakers:
                 desk.is_fed = True
                 self._guard(desk, desk.start_anew)
         for make in sweeps if desks else ():
+            if self._is_cut_short:
+                self._half_drawn = {desk.maker.name for desk in desks}
+                log.warning("stopped while maps were being drawn anew: they stay as they were saved before")
+                return
             source, scan, map_from_sensor = make()
             for desk in desks:
                 if source in desk.maker.sources:
