@@ -36,13 +36,12 @@ Bools = NDArray[np.bool_]
 class BeamTable:
     """Directions of a device's beams by ascending bearing, made once per set of bearings.
 
-    bearing_rad: as given.  order: (N,) beam at each place of the table, None if they come in order.
+    order: (N,) beam at each place of the table, None if they come in order.
     turned_rad: (N,) ascending, from the first that was given.  gap_max_rad: neighbours are no farther apart.
     dir_x, dir_y: (N,) unit vectors.  wedge_m: (N,) how far the wedge to the next entry (the last: to the first) may be
     called looked through; 0 if they are not neighbours.
     """
 
-    bearing_rad: F64
     order: I64 | None
     turned_rad: F64
     gap_max_rad: float
@@ -68,7 +67,6 @@ def beam_table(bearing_rad: F64, fill_gap_m: float) -> BeamTable:
     gap = np.append(np.diff(turned), 2.0 * np.pi - turned[-1:] + turned[:1])
     gap_max = _widest(gap[:-1][gap[:-1] > 0.0])
     return BeamTable(
-        bearing_rad=bearing,
         order=order,
         turned_rad=turned,
         gap_max_rad=gap_max,
