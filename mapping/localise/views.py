@@ -213,6 +213,10 @@ class _Shelf:
         self._sides: dict[bytes, OpenViews] = {}
         self._lock = threading.Lock()
 
+    def __deepcopy__(self, _memo: dict[int, object]) -> _Shelf:
+        """An empty one: what is opened again is the same."""
+        return _Shelf(self._most)
+
     def view(self, number: int, packed: PackedView) -> View:
         view = self._taken(self._views, number)
         return self.put(number, packed.opened()) if view is None else view

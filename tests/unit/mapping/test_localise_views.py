@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -231,3 +232,14 @@ def test_views_that_were_given_up_are_not_looked_at() -> None:
     assert not store.kept().is_there()[99]
     with pytest.raises(ValueError, match="given up"):
         store.kept().opened(np.array([150, 99]))
+
+
+def test_a_copy_of_a_store_goes_its_own_way() -> None:
+    bearing = np.radians(np.arange(-90.0, 91.0, 2.0))
+    table = table_for(bearing)
+    store = ViewStore()
+    store.add(view_of(room_scan(bearing), table, farthest_m=30.0))
+    copied = deepcopy(store)
+    copied.add(view_of(room_scan(bearing, half_m=3.0), table, farthest_m=30.0))
+    assert (len(store), len(copied)) == (1, 2)
+    np.testing.assert_array_equal(copied.kept().view(0).nx, store.kept().view(0).nx)
