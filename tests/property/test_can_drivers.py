@@ -220,17 +220,19 @@ class PerfectNode:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from([1 << 16, 1 << 25]), st.sampled_from([0.0, 0.05, 0.4]))
 def test_no_loss_and_no_reset_makes_motion_up(seed: int, range_ticks: int, loss: float) -> None:
-    """Frames get lost both ways, nodes reboot: between continuous readings the counts are the truth's."""
+    """Frames get lost both ways, nodes reboot: between continuous readings the counts are the truth's at the SYNCs that
+    their stamps tell, however late it was proved that the answers were theirs."""
     random = Random(seed)
     nodes = [PerfectNode(0x20, range_ticks), PerfectNode(0x21, range_ticks)]
     pair = Cia406PairConversation(0x20, 0x21)
     pair.connected(0)
     travelled, reboots = [0, 0], 0
     readings: list[tuple[WheelReading, list[int], int]] = []
-    for step in range(1200):
+    at_sync: list[tuple[list[int], int]] = []  # of each step: what was travelled, and reboots so far
+    for step in range(2400):
         now_ns = step * 2 * MS
         sent = [frame for frame in pair.requests(now_ns) if isinstance(frame, CanFrame)]
-        truth = list(travelled)
+        at_sync.append((list(travelled), reboots))
         heard = [frame for frame in sent if random.random() >= loss]
         arriving = [answer for frame in heard for node in nodes for answer in node.answer(frame)]
         if step % 50 == 0:
@@ -243,7 +245,7 @@ def test_no_loss_and_no_reset_makes_motion_up(seed: int, range_ticks: int, loss:
                 continue
             for reading in pair.receive(frame, now_ns + MS):
                 assert isinstance(reading, WheelReading)
-                readings.append((reading, truth, reboots))
+                readings.append((reading, *at_sync[reading.stamp_ns // (2 * MS)]))
         for side, node in enumerate(nodes):
             move = random.randint(-60, 60)
             travelled[side] += move
