@@ -166,7 +166,7 @@ class LiveMap:
 
     def _find_walls(self, limit_s: float | None = None) -> None:
         if self._makers is not None:
-            self._makers.ask(self._settle_walls, *(() if limit_s is None else (limit_s,)))
+            self._makers.ask(self._settle_walls, limit_s)
 
     def _meta(self, pose: Pose2 | None) -> dict[str, Any]:
         grid = self._layer.grid

@@ -43,7 +43,7 @@ _CLOUDS_WAITING_MAX = 4
 _GRIDS_WAITING_MAX = 256
 _ODOMETRY_WAITING_MAX = 4096
 _TURN_S = 0.1
-_ASK_LIMIT_S = 10.0
+ASK_LIMIT_S = 10.0
 _DRAWN_TO_THE_END = 0.6  # of the time there is to stop in
 Tile = tuple[int, int, bytes]
 Sweep = tuple[str, Scan, F64]
@@ -174,8 +174,15 @@ class MapMakers:
     """Owns the makers and their thread. offer: where outputs go."""
 
     def __init__(
-        self, makers: Sequence[MapMaker], offer: Callable[[Output], None], *, now_ns: Callable[[], int]
+        self,
+        makers: Sequence[MapMaker],
+        offer: Callable[[Output], None],
+        *,
+        now_ns: Callable[[], int],
+        ask_limit_s: float = ASK_LIMIT_S,
     ) -> None:
+        """ask_limit_s: so long a question waits for a turn to end, if it does not say otherwise."""
+        self._ask_limit_s = ask_limit_s
         self._desks = [_Desk(maker) for maker in makers]
         self._offer = offer
         self._now_ns = now_ns
@@ -293,11 +300,12 @@ class MapMakers:
                         self._grids.popleft()
                         self.counts["makers.grids_lost"] += 1
 
-    def ask(self, work: Callable[[], T], limit_s: float = _ASK_LIMIT_S) -> T:
+    def ask(self, work: Callable[[], T], limit_s: float | None = None) -> T:
         """Run a function between two turns and give its result: for calls that look into a maker's map.
 
-        MakersBusy if it was not begun within limit_s.
+        MakersBusy if it was not begun within limit_s, None: what all questions wait.
         """
+        limit_s = self._ask_limit_s if limit_s is None else limit_s
         if not self._thread.is_alive() or threading.current_thread() is self._thread:
             self._take_replaced()
             return work()
@@ -308,8 +316,8 @@ class MapMakers:
             self._changed.notify_all()
         if not done.wait(limit_s):
             self._take_back(question, limit_s)
-            if not done.wait(_ASK_LIMIT_S):  # under way: what it gives out must not be lost
-                raise Trouble(f"the thread of the slow maps did not end a question within {_ASK_LIMIT_S:.0f} s")
+            if not done.wait(ASK_LIMIT_S):  # under way: what it gives out must not be lost
+                raise Trouble(f"the thread of the slow maps did not end a question within {ASK_LIMIT_S:.0f} s")
         error, value = result
         if isinstance(error, BaseException):
             raise error
@@ -324,7 +332,7 @@ class MapMakers:
                     "the computer is busy, or the map was just corrected; try again in a moment"
                 )
 
-    def changed_tiles(self, limit_s: float = _ASK_LIMIT_S) -> dict[str, list[Tile]]:
+    def changed_tiles(self, limit_s: float | None = None) -> dict[str, list[Tile]]:
         """By layer of the store. MakersBusy: nothing was taken, it all comes with the next call."""
         return self.ask(
             lambda: {

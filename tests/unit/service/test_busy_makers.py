@@ -169,11 +169,9 @@ def test_maps_that_are_half_drawn_when_it_stops_are_not_kept(
     assert "they stay as they were saved before" in caplog.text
 
 
-def test_a_map_that_is_to_be_whole_is_not_saved_without_them(
-    makers: MapMakers, store: MapStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_that_is_to_be_whole_is_not_saved_without_them(store: MapStore) -> None:
+    makers = MapMakers([Sketch()], lambda _output: None, now_ns=lambda: 0, ask_limit_s=0.0)
     live = live_map(store, makers)
-    monkeypatch.setattr(MapMakers.ask, "__defaults__", (0.0,))
     with drawing(makers), pytest.raises(MakersBusy):
         live.save("kitchen")
     assert not store.path.with_name("kitchen.umfeld").exists()
